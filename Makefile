@@ -1,0 +1,49 @@
+# Everything runs inside .venv, which the first target that needs it creates.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+DEMO_SOURCE ?= procedural:midtown?blocks=2x2&seed=1
+DEMO_DATA ?= demo_city
+PORT ?= 8000
+
+.PHONY: help demo test test-all check bench format clean
+.DEFAULT_GOAL := help
+
+help: ## list the targets
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
+
+$(VENV)/.ready: pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
+	@touch $@
+
+$(VENV)/.judge: $(VENV)/.ready
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev,judge]'
+	@touch $@
+
+demo: $(VENV)/.ready ## bake a small procedural city and serve it (Ctrl-C stops the server)
+	$(BIN)/sectorlight bake '$(DEMO_SOURCE)' -o $(DEMO_DATA)
+	@echo "Open http://127.0.0.1:$(PORT)/ in a browser"
+	$(BIN)/sectorlight serve $(DEMO_DATA) --port $(PORT)
+
+test: $(VENV)/.ready ## the tests, without the slow ones
+	$(BIN)/python -m pytest
+
+test-all: $(VENV)/.judge ## every test: slow, statistical, and against Mitsuba
+	$(BIN)/python -m pytest -m ''
+
+check: $(VENV)/.ready ## the gate: format, lint, types, tests
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/python -m pytest
+
+bench: $(VENV)/.ready ## timings, each beside its baseline
+	$(BIN)/sectorlight bench
+
+format: $(VENV)/.ready ## rewrite the code in the project's format
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+clean: ## remove the virtual environment and the demo's data
+	rm -rf $(VENV) $(DEMO_DATA)

@@ -1,0 +1,22 @@
+"""Numbers that more than one file must agree on. The contract's are marked (contract): changing one breaks clients."""
+
+SECTOR_SIZE_M = 64.0  # (contract) edge of a sector column; slide "Sector layout"
+VOXEL_SIZE_M = 3.125  # (contract) 100 m / 32; slide "Irradiance volume"
+VOLUME_SHAPE = (16, 32, 32)  # (contract) y, z, x
+MAX_PROBES_PER_SECTOR = 1000  # (contract) slide "Sector layout"
+SKY_SHAPE = (64, 128)  # (contract) rows (polar angle from +Y), columns (from +X towards +Z)
+
+SURFEL_CELL_M = 1.0  # slide "Surfel grid"
+BRICK_CELL_M = 4.0  # slide "Surfel grid"
+
+# No surface outdoors reflects more than fresh snow does, and the feedback loop must contract: each bounce loses at least 5 %.
+ALBEDO_MAX = 0.95
+
+# Voxel classes of ``mask=1`` (contract).
+VOXEL_SOLID, VOXEL_OUTDOORS, VOXEL_INDOORS, VOXEL_NO_SECTOR = range(4)
+
+# Room 0 is outdoors; authored rooms count from 1 in the order of world.toml.
+ROOM_OUTDOORS = 0
+
+# The directions whose irradiance an ambient cube stores (contract): +X -X +Y -Y +Z -Z.
+CUBE_FACES = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))

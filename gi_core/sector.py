@@ -1,0 +1,161 @@
+"""One baked sector as arrays: what the talk's slides "Sector layout", "Surfel grid" and "Relighting" show.
+
+Ragged lists are ``<x>_starts`` (one more than there are items) over flat arrays. Positions are sector-local metres: world position
+minus ``SectorIndex.origin``, so that a world 50 km from its origin loses nothing in float32.
+
+    probe p   reads factors factor_starts[p] .. factor_starts[p + 1]
+    factor f  weighs source factor_source[f] in each of the B basis functions: factor_weight[f]
+    source s  is brick s when s < bricks, otherwise sky patch s - bricks
+    brick b   averages surfels brick_starts[b] .. brick_starts[b + 1]
+    surfel s  is lit by sun and moon through sun_visibility, by feedback_probe[s] with feedback_weight[s], and by its emission
+    voxel v   blends probes voxel_probe[v] with voxel_weight[v]
+
+A factor's weight times its source's exitance [lx] is irradiance [lx]: weights are form factors, and over one cube face they sum to
+at most one (sky included). A sky patch's exitance is pi times its radiance.
+"""
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from gi_core.arrays import AnyArray, Float32, Int32, UInt8, UInt16, UInt32
+from gi_core.constants import MAX_PROBES_PER_SECTOR
+from gi_core.errors import CorruptFileError
+from gi_core.grid import SectorIndex
+
+PROBE_ON_GROUND, PROBE_ON_WALL, PROBE_IN_MARGIN = 1, 2, 4  # bits of probe_flags
+
+
+@dataclass(frozen=True, eq=False)
+class Sector:
+    """A sector's arrays. P probes, F factors, B basis functions, N bricks, S surfels, k feedback probes, D sun planes, K probes a voxel.
+
+    probe_position : (P, 3) float32 [m], sector-local
+    probe_flags : (P,) uint8, bits PROBE_ON_GROUND, PROBE_ON_WALL, PROBE_IN_MARGIN (it lies beyond the border, so that there is no seam)
+    probe_room : (P,) uint16, 0 outdoors
+    factor_starts : (P + 1,) uint32
+    factor_source : (F,) uint32, < N a brick, otherwise sky patch source - N
+    factor_weight : (F, B) float32, form factors
+    brick_starts : (N + 1,) uint32; no brick is empty
+    brick_cell : (N, 3) int32, cell of BRICK_CELL_M in sector-local space
+    brick_direction : (N,) uint8, principal normal direction of its surfels, an ambient cube face
+    surfel_position : (S, 3) float32 [m], sector-local
+    surfel_normal : (S, 3) float32, unit, towards the side that probes see
+    surfel_albedo : (S, 3) float32, linear sRGB, 0..ALBEDO_MAX
+    surfel_snow : (S,) float32, 0..1: how much of fallen snow lies here
+    surfel_emission : (S, 3) float32 [cd m^-2], or None when nothing in the sector shines by itself
+    feedback_probe : (S, k) uint16
+    feedback_weight : (S, k) float32, rows sum to 1, or to 0 where no probe sees the surfel
+    sun_visibility : (D, ceil(S / 32)) uint32; bit s % 32 of word s // 32 of plane d: surfel s sees the sun of plane d
+    voxel_first : (3,) int32, world lattice index (x, y, z) of voxel (0, 0, 0)
+    voxel_class : (ny, nz, nx) uint8, VOXEL_SOLID, VOXEL_OUTDOORS or VOXEL_INDOORS
+    voxel_room : (ny, nz, nx) uint16
+    voxel_probe : (ny, nz, nx, K) uint16
+    voxel_weight : (ny, nz, nx, K) float32, sums to 1 at every voxel (solid ones blend what the nearest air blends), or to 0
+        everywhere when the sector has no probe
+    """
+
+    index: SectorIndex
+    probe_position: Float32
+    probe_flags: UInt8
+    probe_room: UInt16
+    factor_starts: UInt32
+    factor_source: UInt32
+    factor_weight: Float32
+    brick_starts: UInt32
+    brick_cell: Int32
+    brick_direction: UInt8
+    surfel_position: Float32
+    surfel_normal: Float32
+    surfel_albedo: Float32
+    surfel_snow: Float32
+    surfel_emission: Float32 | None
+    feedback_probe: UInt16
+    feedback_weight: Float32
+    sun_visibility: UInt32
+    voxel_first: Int32
+    voxel_class: UInt8
+    voxel_room: UInt16
+    voxel_probe: UInt16
+    voxel_weight: Float32
+
+    @property
+    def probe_count(self) -> int:
+        return len(self.probe_position)
+
+    @property
+    def factor_count(self) -> int:
+        return len(self.factor_source)
+
+    @property
+    def brick_count(self) -> int:
+        return len(self.brick_direction)
+
+    @property
+    def surfel_count(self) -> int:
+        return len(self.surfel_position)
+
+    @property
+    def basis_size(self) -> int:
+        return int(self.factor_weight.shape[1])
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all arrays in memory."""
+        arrays = (getattr(self, field.name) for field in fields(self))
+        return sum(a.nbytes for a in arrays if isinstance(a, np.ndarray))
+
+
+def check_sector(sector: Sector, sky_patches: int) -> None:
+    """Raise CorruptFileError unless every count, range and index of a sector holds; what it accepts cannot read out of bounds."""
+    s = sector
+
+    def expect(ok: bool | np.bool_, what: str) -> None:
+        if not ok:
+            raise CorruptFileError(f"sector {s.index}: expected {what}")
+
+    def starts(values: AnyArray, items: int, total: int, name: str) -> None:
+        expect(values.shape == (items + 1,), f"{name} to have {items + 1} entries, got {values.shape}")
+        expect(values[0] == 0 and values[-1] == total, f"{name} to run from 0 to {total}")
+        expect((np.diff(values.astype(np.int64)) >= 0).all(), f"{name} to be non-decreasing")
+
+    expect(s.probe_count <= MAX_PROBES_PER_SECTOR, f"at most {MAX_PROBES_PER_SECTOR} probes, got {s.probe_count}")
+    starts(s.factor_starts, s.probe_count, s.factor_count, "factor_starts")
+    starts(s.brick_starts, s.brick_count, s.surfel_count, "brick_starts")
+    expect((np.diff(s.brick_starts.astype(np.int64)) > 0).all(), "no empty brick")
+    per_probe = {"probe_flags": s.probe_flags, "probe_room": s.probe_room}
+    per_surfel = {
+        "surfel_normal": s.surfel_normal,
+        "surfel_albedo": s.surfel_albedo,
+        "surfel_snow": s.surfel_snow,
+        "feedback_probe": s.feedback_probe,
+        "feedback_weight": s.feedback_weight,
+    }
+    if s.surfel_emission is not None:
+        per_surfel["surfel_emission"] = s.surfel_emission
+    for name, values in per_probe.items():
+        expect(len(values) == s.probe_count, f"{name} for {s.probe_count} probes, got {len(values)}")
+    for name, values in per_surfel.items():
+        expect(len(values) == s.surfel_count, f"{name} for {s.surfel_count} surfels, got {len(values)}")
+    expect(s.feedback_probe.shape == s.feedback_weight.shape, "as many feedback weights as probes")
+    expect(len(s.factor_weight) == s.factor_count, f"weights for {s.factor_count} factors, got {len(s.factor_weight)}")
+    expect(len(s.brick_cell) == s.brick_count, f"cells for {s.brick_count} bricks, got {len(s.brick_cell)}")
+    expect(s.sun_visibility.shape[1] == (s.surfel_count + 31) // 32, f"sun visibility planes of {s.surfel_count} bits")
+    expect(s.voxel_class.ndim == 3 and s.voxel_room.shape == s.voxel_class.shape, "one class and one room per voxel")
+    expect(s.voxel_probe.shape[:3] == s.voxel_class.shape, "one probe list per voxel")
+    expect(s.voxel_probe.shape == s.voxel_weight.shape, "as many voxel weights as probes")
+    if s.factor_count:
+        expect(int(s.factor_source.max()) < s.brick_count + sky_patches, f"factors of {s.brick_count} bricks and {sky_patches} patches")
+    if s.probe_count:
+        expect(not s.feedback_probe.size or int(s.feedback_probe.max()) < s.probe_count, f"feedback from {s.probe_count} probes")
+        expect(not s.voxel_probe.size or int(s.voxel_probe.max()) < s.probe_count, f"voxels of {s.probe_count} probes")
+    else:
+        expect(not s.feedback_weight.any() and not s.voxel_weight.any(), "no weights in a sector without probes")
+    expect(s.brick_direction.max(initial=0) < 6, "brick directions below 6")
+    expect(s.voxel_class.max(initial=0) <= 2, "voxel classes 0..2")
+    for field in fields(s):
+        values = getattr(s, field.name)
+        if isinstance(values, np.ndarray) and values.dtype.kind == "f":
+            expect(np.isfinite(values).all(), f"finite {field.name}")
+    for name, values in (("factor_weight", s.factor_weight), ("surfel_albedo", s.surfel_albedo)):
+        expect((values >= 0).all() and (values <= 1.001).all(), f"{name} within 0..1")

@@ -1,0 +1,75 @@
+"""What a whole world has: where on Earth it lies, its rooms and lamps. Part of world.json; no geometry."""
+
+from dataclasses import dataclass
+from datetime import date
+
+import numpy as np
+
+from gi_core.arrays import Float64
+
+
+@dataclass(frozen=True)
+class Location:
+    """Where and when the world is.
+
+    latitude_degrees, longitude_degrees : WGS84, north and east positive
+    elevation_m : above the sea
+    timezone : IANA name; local times are read in it
+    north_degrees : compass azimuth of the world's -Z axis, clockwise from true north, so that streets can run along the axes
+    date : the day that a bare ``HH:MM`` means
+    source : "given", or "default" when the input says nothing about its place
+    """
+
+    latitude_degrees: float = 40.7484
+    longitude_degrees: float = -73.9857
+    elevation_m: float = 10.0
+    timezone: str = "America/New_York"
+    north_degrees: float = 0.0
+    date: date = date(2024, 6, 21)
+    source: str = "default"
+
+
+@dataclass(frozen=True)
+class Room:
+    """An axis-aligned box of indoor air. ``minimum`` and ``maximum`` are world positions (x, y, z) [m]."""
+
+    name: str
+    minimum: tuple[float, float, float]
+    maximum: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """A local light as authored. Carried in the dataset.
+
+    kind : "point", "spot" or "area"
+    position : (x, y, z) [m]; lumens : luminous flux [lm]; color : linear sRGB, luminance 1 when (1, 1, 1)
+    range_m : beyond this it gives nothing
+    """
+
+    name: str
+    kind: str
+    position: tuple[float, float, float]
+    lumens: float
+    color: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    range_m: float = 30.0
+
+
+def direction_from_azimuth(azimuth_degrees: float, elevation_degrees: float, north_degrees: float) -> Float64:
+    """Unit vector (3,) in the world frame towards a compass azimuth (clockwise from true north) and an elevation.
+
+    With north_degrees = 0, azimuth 0 is -Z and azimuth 90 is +X.
+    """
+    azimuth = np.radians(azimuth_degrees - north_degrees)
+    elevation = np.radians(elevation_degrees)
+    level = np.cos(elevation)
+    return np.array([level * np.sin(azimuth), np.sin(elevation), -level * np.cos(azimuth)])
+
+
+def world_from_east_north(east: Float64, north: Float64, north_degrees: float) -> tuple[Float64, Float64]:
+    """World x and z [m] of offsets towards true east and true north [m], arrays of any equal shape."""
+    turn = np.radians(north_degrees)
+    # A compass bearing b lies at bearing b - north_degrees from -Z.
+    x = east * np.cos(turn) - north * np.sin(turn)
+    minus_z = east * np.sin(turn) + north * np.cos(turn)
+    return x, -minus_z

@@ -1,0 +1,1 @@
+"""HTTP service, command line and load test. Knows gi_core; never bake_jobs (the command line imports that lazily)."""
