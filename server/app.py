@@ -1,0 +1,51 @@
+"""The HTTP application: routes, problems, the viewer page. Built by a function, so that a process can serve any dataset."""
+
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from fastapi import Depends, FastAPI
+from fastapi.responses import FileResponse
+from fastapi.staticfiles import StaticFiles
+
+from server import problems
+from server.dependencies import refuse_repeated_parameters
+from server.routes import distant, health, lighting, preview, probes, sectors, volume, world
+from server.service import Service
+from server.settings import Settings
+
+VIEWER = Path(__file__).parent / "viewer"
+
+
+def create_app(dataset_path: Path, settings: Settings) -> FastAPI:
+    """An application that serves one dataset; InputError or FormatError when the dataset or the device cannot be used."""
+    return app_of(Service.open(dataset_path, settings.checked()))
+
+
+def app_of(service: Service) -> FastAPI:
+    """An application on top of an open service."""
+    app = FastAPI(
+        title="Sectorlight",
+        version=_version(),
+        summary="Dynamic global illumination of a baked city, at any hour and weather",
+        description="Errors are `application/problem+json` with a stable `code`. World frame: metres, Y up, X east, Z south.",
+        dependencies=[Depends(refuse_repeated_parameters)],
+        redirect_slashes=False,
+    )
+    app.state.service = service
+    problems.install(app)
+    for resource in (health, world, lighting, volume, distant, sectors, probes, preview):
+        app.include_router(resource.router)
+    app.mount("/viewer", StaticFiles(directory=VIEWER), name="viewer")
+
+    @app.get("/", include_in_schema=False)
+    def viewer() -> FileResponse:
+        return FileResponse(VIEWER / "index.html", headers={"Cache-Control": "no-cache"})
+
+    return app
+
+
+def _version() -> str:
+    try:
+        return version("sectorlight")
+    except PackageNotFoundError:  # run from a checkout that is not installed
+        return "0+unknown"

@@ -1,0 +1,134 @@
+"""What requests may say. Each route takes one of these classes; a parameter that its class does not have is refused by name.
+
+Bounds here only keep arithmetic finite and work small; whether a place or a weather exists is the engine's to say.
+"""
+
+import math
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from fastapi import Depends, Request
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic_core import PydanticCustomError
+
+from gi_core.arrays import Float64
+from gi_core.errors import InputError
+from server.encoding import ArrayFormat, RawEncoding
+from server.service import Service
+
+# Beyond this float32 metres are coarser than a voxel's position needs, and no world reaches it.
+MAX_COORDINATE_M = 1e7
+MAX_PROBE_RADIUS_M = 100.0  # at most 5 x 5 sectors, 25 000 probes
+MAX_PREVIEW_WIDTH = 1920
+
+Coordinate = Annotated[float, Field(ge=-MAX_COORDINATE_M, le=MAX_COORDINATE_M, allow_inf_nan=False, description="world metres")]
+
+
+class StrictQuery(BaseModel):
+    """Query parameters; unknown ones are refused, so that a typo is not silently the default."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _refuse_unknown(cls, values: Any) -> Any:
+        unknown = sorted(set(values) - set(cls.model_fields)) if isinstance(values, dict) else []
+        if unknown:
+            shown = ", ".join(name[:40] for name in unknown[:5])
+            known = ", ".join(cls.model_fields) or "none"
+            message = "unknown query parameter {shown}; expected {known}"
+            raise PydanticCustomError("unknown_parameter", message, {"shown": shown, "known": known})
+        return values
+
+
+class LightingQuery(StrictQuery):
+    time: str = Field(max_length=64, description="`13:00`, or ISO 8601 local time with a date", examples=["13:00"])
+    weather: str = Field(max_length=200, description="a preset that /v1/world lists", examples=["clear"])
+
+
+class SkyQuery(LightingQuery):
+    format: Literal["npy"] = "npy"
+
+
+class PositionQuery(LightingQuery):
+    x: Coordinate
+    y: Coordinate
+    z: Coordinate
+
+    @property
+    def position(self) -> Float64:
+        """(3,) float64 [m], world frame."""
+        return np.array([self.x, self.y, self.z], np.float64)
+
+
+class VolumeQuery(PositionQuery):
+    kind: Literal["outdoor"] = "outdoor"
+    basis: Literal["cube"] = "cube"
+    cascade: int = Field(0, ge=0, le=0, description="0: 32 x 16 x 32 voxels of 3.125 m")
+    format: ArrayFormat = "npy"
+    encoding: RawEncoding = Field("f16", description="of format=raw: RGBA half floats; lux = rgb x scale; alpha = 1 in free air, else 0")
+    mask: bool = Field(False, description="1: the voxels' classes (uint8) instead of light")
+
+
+class DistantQuery(LightingQuery):
+    format: ArrayFormat = "npy"
+    encoding: RawEncoding = "f16"
+
+
+class ProbesQuery(PositionQuery):
+    radius: float = Field(30.0, gt=0, le=MAX_PROBE_RADIUS_M, allow_inf_nan=False, description="metres")
+
+
+def _three_numbers(text: str) -> str:
+    parse_vector(text)
+    return text
+
+
+def parse_vector(text: str) -> Float64:
+    """(3,) float64 from "x,y,z"; ValueError when it is anything else."""
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != 3 or not all(math.isfinite(v) and abs(v) <= MAX_COORDINATE_M for v in values):
+        raise ValueError(f"expected three numbers x,y,z within {MAX_COORDINATE_M:g} m, found {text[:60]!r}")
+    return np.array(values, np.float64)
+
+
+Vector = Annotated[str, Field(max_length=120, examples=["32,20,96"]), AfterValidator(_three_numbers)]
+
+
+class PreviewQuery(LightingQuery):
+    eye: Vector = Field(description="where the camera is, x,y,z [m]")
+    look: Vector = Field(description="what it looks at, x,y,z [m]")
+    fov: float = Field(60.0, ge=1, le=150, allow_inf_nan=False, description="horizontal angle [degrees]")
+    width: int = Field(640, ge=16, le=MAX_PREVIEW_WIDTH, description="pixels; the height is 9/16 of it")
+    gi: Literal["on", "off", "split"] = Field("on", description="off: direct sun and moon only; split: left off, right on")
+
+    @model_validator(mode="after")
+    def _has_direction(self) -> "PreviewQuery":
+        if np.linalg.norm(parse_vector(self.look) - parse_vector(self.eye)) < 1e-3:
+            raise ValueError("look: expected a point at least 1 mm from eye, found the same point")
+        return self
+
+
+class NoQuery(StrictQuery):
+    """For routes that take no parameters."""
+
+
+def refuse_repeated_parameters(request: Request) -> None:
+    """InputError when a parameter is given twice: either value may be the one that was meant."""
+    names = [name for name, _ in request.query_params.multi_items()]
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    if repeated:
+        raise InputError(f"query: expected each parameter once, found {repeated[0][:40]} more than once")
+
+
+def get_service(request: Request) -> Service:
+    """The running server's service."""
+    service = request.app.state.service
+    assert isinstance(service, Service)
+    return service
+
+
+ServiceDep = Annotated[Service, Depends(get_service)]

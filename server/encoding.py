@@ -1,0 +1,55 @@
+"""Arrays as bytes: ``npy`` is exact, ``raw`` is for GPUs."""
+
+import io
+import json
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import numpy as np
+
+from gi_core.arrays import AnyArray, Float32, UInt8
+
+ArrayFormat = Literal["npy", "raw"]
+RawEncoding = Literal["f16"]
+
+# Changes whenever the bytes of a reply change for the same data; part of every ETag.
+REPLY_VERSION = 1
+
+HALF_MAX = 65504.0
+MEDIA_TYPE: dict[ArrayFormat, str] = {"npy": "application/x-npy", "raw": "application/octet-stream"}
+
+
+def npy(array: AnyArray) -> bytes:
+    """An array as a version 1.0 .npy file, C order."""
+    out = io.BytesIO()
+    np.lib.format.write_array(out, np.ascontiguousarray(array), version=(1, 0), allow_pickle=False)
+    return out.getvalue()
+
+
+def half_scale(values: Float32) -> float:
+    """The power of two by which lux are divided so that the largest fills, and does not overflow, a half float.
+
+    A power of two leaves mantissas alone, so the error is the half's own (2^-11); the values then span 2^15 down to 2^-14, 29 stops
+    below the brightest, before precision falls. A texture of zeros has scale 1.
+    """
+    peak = float(values.max(initial=0.0))
+    if peak <= 0:
+        return 1.0
+    return float(2.0 ** np.ceil(np.log2(peak / HALF_MAX)))
+
+
+def half_texels(values: Float32, scale: float, alpha: UInt8 | None = None) -> bytes:
+    """Colours (..., 3) [lx] as little-endian RGBA half floats, colour / scale.
+
+    alpha : (...) uint8, broadcast against values[..., 0]: 0 or 1; 1 everywhere when it is None. GPUs have no three-channel 16-bit format.
+    """
+    texels = np.ones((*values.shape[:-1], 4), "<f2")
+    texels[..., :3] = values / np.float32(scale)
+    if alpha is not None:
+        texels[..., 3] = alpha
+    return texels.tobytes()
+
+
+def header_json(facts: Mapping[str, Any]) -> str:
+    """Facts as one line of ASCII JSON, fit for a header."""
+    return json.dumps(facts, separators=(",", ":"), ensure_ascii=True, allow_nan=False)

@@ -1,0 +1,97 @@
+"""Errors on the wire: ``application/problem+json`` (RFC 9457), always. One table says which error is which status."""
+
+import logging
+from collections.abc import Mapping
+from http import HTTPStatus
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from starlette.exceptions import HTTPException
+
+from gi_core.errors import (
+    FormatError,
+    InputError,
+    OutsideWorldError,
+    SectorlightError,
+    SectorMissingError,
+)
+
+log = logging.getLogger("sectorlight.http")
+
+# First match wins, so a class stands above its bases.
+STATUS_OF: tuple[tuple[type[Exception], HTTPStatus], ...] = (
+    (OutsideWorldError, HTTPStatus.NOT_FOUND),
+    (InputError, HTTPStatus.BAD_REQUEST),
+    (SectorMissingError, HTTPStatus.NOT_FOUND),
+    (FormatError, HTTPStatus.SERVICE_UNAVAILABLE),
+    (SectorlightError, HTTPStatus.INTERNAL_SERVER_ERROR),
+)
+
+CODE_OF_STATUS = {400: "bad_request", 404: "no_such_path", 405: "method_not_allowed", 416: "range_not_satisfiable"}
+
+
+class RangeError(InputError):
+    """A byte range that lies beyond the file: HTTP 416."""
+
+    code = "range_not_satisfiable"
+
+    def __init__(self, message: str, size: int) -> None:
+        super().__init__(message)
+        self.size = size
+
+
+def problem(status: int, code: str, detail: str, headers: Mapping[str, str] | None = None, **members: Any) -> JSONResponse:
+    """A problem reply. ``members`` are extensions such as ``expected`` or ``errors``."""
+    body = {"title": HTTPStatus(status).phrase, "status": int(status), "code": code, "detail": detail, **members}
+    no_store = {"Cache-Control": "no-store"}
+    return JSONResponse(body, status, headers={**no_store, **(headers or {})}, media_type="application/problem+json")
+
+
+def install(app: FastAPI) -> None:
+    """Make every error of ``app`` a problem reply."""
+    app.add_exception_handler(RequestValidationError, _bad_parameters)
+    app.add_exception_handler(HTTPException, _http_error)
+    app.add_exception_handler(RangeError, _range_error)
+    app.add_exception_handler(SectorlightError, _own_error)
+    app.add_exception_handler(Exception, _unexpected)
+
+
+def _own_error(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, SectorlightError)
+    status = next(status for kind, status in STATUS_OF if isinstance(error, kind))
+    if status >= 500:
+        log.error("%s: %s", request.url.path, error)
+    # FileNotFoundError and LookupError quote their argument in str(): the text itself is args[0].
+    return problem(status, error.code, str(error.args[0]) if error.args else error.code)
+
+
+def _range_error(_: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, RangeError)
+    return problem(416, error.code, str(error), {"Content-Range": f"bytes */{error.size}"})
+
+
+def _bad_parameters(_: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, RequestValidationError)
+    errors = [
+        {"parameter": ".".join(str(part) for part in item["loc"][1:]) or None, "expected": item["msg"], "code": item["type"]}
+        for item in error.errors()
+    ]
+    detail = "; ".join(f"{e['parameter']}: {e['expected']}" if e["parameter"] else str(e["expected"]) for e in errors)
+    return problem(400, "bad_parameter", detail, errors=errors)
+
+
+def _http_error(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, HTTPException)
+    status = error.status_code
+    detail = {
+        404: f"{request.url.path}: no such path; expected one that /docs lists",
+        405: f"{request.method} {request.url.path}: expected {(error.headers or {}).get('Allow', 'another method')}",
+    }.get(status, str(error.detail))
+    return problem(status, CODE_OF_STATUS.get(status, "http_error"), detail, error.headers)
+
+
+def _unexpected(request: Request, error: Exception) -> JSONResponse:
+    log.error("%s failed", request.url.path, exc_info=error)
+    return problem(500, "internal", "our failure; the server's log says more")

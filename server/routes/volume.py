@@ -1,0 +1,70 @@
+"""The irradiance volume around a point."""
+
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query, Request, Response
+from gi_core.volume import Volume
+
+from gi_core.constants import VOXEL_INDOORS, VOXEL_OUTDOORS
+from server.caching import Body, conditional, strong_etag
+from server.dependencies import ServiceDep, VolumeQuery
+from server.encoding import MEDIA_TYPE, REPLY_VERSION, half_scale, half_texels, header_json, npy
+
+router = APIRouter(prefix="/v1", tags=["light"])
+
+
+@router.get("/volume", response_class=Response, responses={200: {"content": {media: {} for media in MEDIA_TYPE.values()}}})
+def volume(request: Request, service: ServiceDep, query: Annotated[VolumeQuery, Query()]) -> Response:
+    """Irradiance [lx] in the 32 x 16 x 32 voxels around a point, snapped to the world's lattice.
+
+    `npy`: float32 (6, 16, 32, 32, 3) = face +X -X +Y -Y +Z -Z, y, z, x, channel.
+    `raw`: little-endian halves (6, 16, 32, 32, 4); lux = rgb x scale; alpha is 1 in free air, else 0.
+    `mask=1`: uint8 (16, 32, 32), 0 solid, 1 outdoors, 2 indoors, 3 no sector there. The header `Gi-Volume` places it in the world.
+    """
+    light = service.lighting(query.time, query.weather)
+    etag = strong_etag("volume", REPLY_VERSION, service.dataset.digest, light.digest, query.model_dump(exclude={"time", "weather"}))
+
+    def compute() -> Body:
+        with service.engine_turn() as engine:
+            found = engine.volume(query.position, light)
+        return mask_body(found, query) if query.mask else light_body(found, query)
+
+    return conditional(request, etag, compute)
+
+
+def light_body(found: Volume, query: VolumeQuery) -> Body:
+    """The light of a volume in the format that was asked for."""
+    values = found.values
+    if query.format == "npy":
+        return _body(npy(values), query, volume_facts(found, values.shape, "float32", 1.0))
+    scale = half_scale(values)
+    free = ((found.mask == VOXEL_OUTDOORS) | (found.mask == VOXEL_INDOORS)).astype("u1")
+    texels = half_texels(values, scale, free)
+    return _body(texels, query, volume_facts(found, (*values.shape[:-1], 4), "float16", scale))
+
+
+def mask_body(found: Volume, query: VolumeQuery) -> Body:
+    """The classes of a volume's voxels."""
+    content = npy(found.mask) if query.format == "npy" else found.mask.tobytes()
+    return _body(content, query, volume_facts(found, found.mask.shape, "uint8", 1.0))
+
+
+def volume_facts(found: Volume, shape: tuple[int, ...], dtype: str, scale: float) -> dict[str, Any]:
+    """What ``Gi-Volume`` says. ``origin`` is the centre of voxel (0, 0, 0) in world metres."""
+    return {
+        "origin": [float(v) for v in found.origin],
+        "voxel_size": [float(v) for v in found.voxel_size],
+        "shape": list(shape),
+        "dtype": dtype,
+        "basis": found.basis,
+        "unit": "lx",
+        "scale": scale,
+        "sectors": [[index.x, index.z] for index in found.sectors],
+        "valid": round(float(found.valid), 6),
+        "expected_error": found.expected_error,
+    }
+
+
+def _body(content: bytes, query: VolumeQuery, facts: Mapping[str, Any]) -> Body:
+    return Body(content, MEDIA_TYPE[query.format], {"Gi-Volume": header_json(facts)})

@@ -1,0 +1,72 @@
+"""What is served: bounds, sector grid, location, presets, dataset facts, limits."""
+
+from typing import Annotated
+
+from fastapi import APIRouter, Query, Request, Response
+from gi_core.dataset import WorldInfo
+
+from gi_core.constants import MAX_PROBES_PER_SECTOR, SECTOR_SIZE_M, VOLUME_SHAPE, VOXEL_SIZE_M
+from gi_core.weather import WEATHER_RANGES, weather_presets
+from server.caching import Body, conditional, strong_etag
+from server.dependencies import MAX_PREVIEW_WIDTH, MAX_PROBE_RADIUS_M, NoQuery, ServiceDep
+from server.encoding import REPLY_VERSION
+from server.models import BoundsReply, LimitsReply, LocationReply, RoomReply, SectorGridReply, WorldReply, vector3
+
+router = APIRouter(prefix="/v1", tags=["dataset"])
+
+
+@router.get("/world", response_model=WorldReply)
+def world(request: Request, service: ServiceDep, _: Annotated[NoQuery, Query()]) -> Response:
+    """What a client needs to know before it asks for light."""
+    etag = strong_etag("world", REPLY_VERSION, service.dataset.digest, weather_presets())
+    return conditional(
+        request,
+        etag,
+        lambda: Body(world_reply(service.dataset.world, service.dataset.digest).model_dump_json().encode(), "application/json"),
+    )
+
+
+def world_reply(info: WorldInfo, digest: str) -> WorldReply:
+    """A dataset's facts as the contract names them."""
+    place = info.location
+    return WorldReply(
+        name=info.name,
+        bounds=BoundsReply(minimum=vector3(info.bounds[0]), maximum=vector3(info.bounds[1])),
+        location=LocationReply(
+            latitude_degrees=place.latitude_degrees,
+            longitude_degrees=place.longitude_degrees,
+            elevation_m=place.elevation_m,
+            timezone=place.timezone,
+            north_degrees=place.north_degrees,
+            date=place.date.isoformat(),
+            source=place.source,
+        ),
+        sectors=sector_grid(info),
+        weather=list(weather_presets()),
+        weather_overrides=dict(WEATHER_RANGES),
+        time="HH:MM, or ISO 8601 local time with a date",
+        voxel_size_m=VOXEL_SIZE_M,
+        volume_shape=VOLUME_SHAPE,
+        rooms=[RoomReply(name=room.name, minimum=room.minimum, maximum=room.maximum) for room in info.rooms],
+        limits=LimitsReply(probe_radius_m=MAX_PROBE_RADIUS_M, preview_width=MAX_PREVIEW_WIDTH, probes_per_sector=MAX_PROBES_PER_SECTOR),
+        dataset={
+            "digest": digest,
+            "source": info.source,
+            "preset": info.preset,
+            "basis": info.basis,
+            "settings": info.settings,
+            "counts": info.counts,
+            "error_report": info.error_report,
+        },
+    )
+
+
+def sector_grid(info: WorldInfo) -> SectorGridReply:
+    """Extent of the sectors that were baked; there may be gaps."""
+    xs, zs = [index.x for index in info.sectors], [index.z for index in info.sectors]
+    return SectorGridReply(
+        size_m=SECTOR_SIZE_M,
+        count=len(xs),
+        minimum=(min(xs), min(zs)) if xs else None,
+        maximum=(max(xs), max(zs)) if xs else None,
+    )

@@ -1,0 +1,36 @@
+"""From cd/m2 to the bytes of a picture."""
+
+import io
+
+import numpy as np
+from PIL import Image
+
+from gi_core.arrays import AnyArray, Float32, UInt8
+
+# Saturation-based ISO speed (ISO 12232): the luminance that EV100 exposes to white is 1.2 x 2^EV100.
+WHITE_PER_EV = 1.2
+
+
+def exposed(radiance: Float32, ev100: float) -> Float32:
+    """Radiance [cd m^-2] relative to the white of an exposure."""
+    return np.asarray(radiance * np.float32(1.0 / (WHITE_PER_EV * 2.0**ev100)), np.float32)
+
+
+def filmic(linear: Float32) -> Float32:
+    """0..inf -> 0..1 with a shoulder and a toe: Narkowicz's fit of the ACES curve (2015), per channel."""
+    x = np.minimum(np.maximum(linear, 0), 1e4)  # beyond this the curve is flat and its squares would only lose precision
+    return np.asarray(np.clip(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0, 1), np.float32)
+
+
+def srgb_bytes(linear: Float32) -> UInt8:
+    """Linear 0..1 -> sRGB 0..255 (IEC 61966-2-1)."""
+    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)
+    return np.asarray(encoded * 255 + 0.5).astype(np.uint8)
+
+
+def png(radiance: Float32, ev100: float) -> bytes:
+    """A PNG of radiance (rows, columns, 3) [cd m^-2]."""
+    picture: AnyArray = srgb_bytes(filmic(exposed(radiance, ev100)))
+    out = io.BytesIO()
+    Image.fromarray(picture).save(out, "PNG", compress_level=6)
+    return out.getvalue()
