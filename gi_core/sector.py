@@ -18,7 +18,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from gi_core.arrays import AnyArray, Float32, Int32, UInt8, UInt16, UInt32
+from gi_core.arrays import AnyArray, Float32, Int32, Int64, UInt8, UInt16, UInt32
 from gi_core.constants import MAX_PROBES_PER_SECTOR
 from gi_core.errors import CorruptFileError
 from gi_core.grid import SectorIndex
@@ -106,6 +106,17 @@ class Sector:
         return sum(a.nbytes for a in arrays if isinstance(a, np.ndarray))
 
 
+def counts(list_starts: AnyArray) -> Int64:
+    """Items of each list, from its ``starts``: (n + 1,) -> (n,) int64."""
+    wide = list_starts.astype(np.int64)
+    return wide[1:] - wide[:-1]
+
+
+def starts(list_counts: AnyArray) -> UInt32:
+    """``starts`` of lists of these lengths: (n,) -> (n + 1,) uint32."""
+    return np.concatenate([[0], np.cumsum(list_counts, dtype=np.int64)]).astype(np.uint32)
+
+
 def check_sector(sector: Sector, sky_patches: int) -> None:
     """Raise CorruptFileError unless every count, range and index of a sector holds; what it accepts cannot read out of bounds."""
     s = sector
@@ -114,17 +125,17 @@ def check_sector(sector: Sector, sky_patches: int) -> None:
         if not ok:
             raise CorruptFileError(f"sector {s.index}: expected {what}")
 
-    def starts(values: AnyArray, items: int, total: int, name: str) -> None:
+    def expect_starts(values: AnyArray, items: int, total: int, name: str) -> None:
         expect(values.shape == (items + 1,), f"{name} to have {items + 1} entries, got {values.shape}")
         expect(values[0] == 0 and values[-1] == total, f"{name} to run from 0 to {total}")
-        expect((np.diff(values.astype(np.int64)) >= 0).all(), f"{name} to be non-decreasing")
+        expect((counts(values) >= 0).all(), f"{name} to be non-decreasing")
 
     expect(s.probe_count <= MAX_PROBES_PER_SECTOR, f"at most {MAX_PROBES_PER_SECTOR} probes, got {s.probe_count}")
-    starts(s.factor_starts, s.probe_count, s.factor_count, "factor_starts")
-    starts(s.brick_starts, s.brick_count, s.surfel_count, "brick_starts")
-    expect((np.diff(s.brick_starts.astype(np.int64)) > 0).all(), "no empty brick")
-    per_probe = {"probe_flags": s.probe_flags, "probe_room": s.probe_room}
-    per_surfel = {
+    expect_starts(s.factor_starts, s.probe_count, s.factor_count, "factor_starts")
+    expect_starts(s.brick_starts, s.brick_count, s.surfel_count, "brick_starts")
+    expect((counts(s.brick_starts) > 0).all(), "no empty brick")
+    per_probe: dict[str, AnyArray] = {"probe_flags": s.probe_flags, "probe_room": s.probe_room}
+    per_surfel: dict[str, AnyArray] = {
         "surfel_normal": s.surfel_normal,
         "surfel_albedo": s.surfel_albedo,
         "surfel_snow": s.surfel_snow,

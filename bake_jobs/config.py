@@ -1,0 +1,66 @@
+"""What a bake may trade. A preset is a set of values of these knobs; the file format knows none of them."""
+
+from dataclasses import asdict, dataclass
+from typing import Any, Literal, get_args
+
+from gi_core.errors import InputError
+
+Preset = Literal["draft", "talk"]
+PRESETS: tuple[str, ...] = get_args(Preset)
+
+
+@dataclass(frozen=True)
+class BakeSettings:
+    """Knobs of a bake. "More" says what a larger value buys, after the unit.
+
+    rays_per_face_edge : rays along an edge of a probe's cube map face; more: smoother factors, slower bake
+    grid_spacing_m [m] : ray-cast grid of probes; less: more probes
+    probe_height_m [m] : probes stand this high above what the grid's ray hit
+    head_room_m [m] : a hit with less free air above gets no probe
+    wall_spacing_m [m] : probes along walls, sideways and up to wall_doubling_m; less: more probes
+    wall_doubling_m [m] : above this height over the scene's lowest point, the upward spacing doubles at every step
+    wall_offset_m [m] : wall probes stand this far off their wall
+    margin_m [m] : probes are also placed this far beyond the sector's border, by the same rule, so that no seam shows
+    sun_declination_step_degrees, sun_hour_step_degrees : spacing of the baked sun directions; less: sharper shadows, larger files
+    voxel_probes : probes that a voxel blends at most
+    voxel_candidates : nearest probes that are tested for visibility from a voxel
+    feedback_probes : probes that light a surfel
+    """
+
+    preset: str = "talk"
+    basis: str = "cube"
+    sky: str = "faces"
+    rays_per_face_edge: int = 16
+    grid_spacing_m: float = 4.0
+    probe_height_m: float = 1.5
+    head_room_m: float = 2.0
+    wall_spacing_m: float = 8.0
+    wall_doubling_m: float = 32.0
+    wall_offset_m: float = 1.0
+    margin_m: float = 4.0
+    sun_declination_step_degrees: float = 9.5
+    sun_hour_step_degrees: float = 10.0
+    voxel_probes: int = 4
+    voxel_candidates: int = 8
+    feedback_probes: int = 1
+
+    def to_json(self) -> dict[str, Any]:
+        """The knobs as a JSON object."""
+        return asdict(self)
+
+
+def settings_for(preset: str) -> BakeSettings:
+    """Settings of a preset. Raises InputError for a name that is not one."""
+    if preset == "talk":
+        return BakeSettings()
+    if preset == "draft":
+        return BakeSettings(
+            preset="draft",
+            rays_per_face_edge=8,
+            grid_spacing_m=8.0,
+            margin_m=8.0,
+            wall_spacing_m=16.0,
+            sun_declination_step_degrees=16.0,
+            sun_hour_step_degrees=15.0,
+        )
+    raise InputError(f"quality {preset!r}: expected one of {', '.join(PRESETS)}")

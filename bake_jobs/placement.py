@@ -1,0 +1,199 @@
+"""Where probes go (slide "Probe placement"): on every hit of a ray-cast grid, and along building walls.
+
+All positions come from world lattices, so two sectors place the same probes in the margin that they share.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from bake_jobs.config import BakeSettings
+from bake_jobs.gbuffer import inside_solid
+from bake_jobs.rays import SURFACE_OFFSET_M, RayScene
+from bake_jobs.scene import ProbeHint
+from gi_core.arrays import Bool, Float64, UInt8, UInt16
+from gi_core.constants import MAX_PROBES_PER_SECTOR, ROOM_OUTDOORS, SECTOR_SIZE_M
+from gi_core.grid import SectorIndex
+from gi_core.sector import PROBE_IN_MARGIN, PROBE_ON_GROUND, PROBE_ON_WALL
+from gi_core.world import Room
+
+# A vertical ray meets at most this many surfaces: a tower of 100 storeys has 200.
+MAX_LAYERS = 256
+# Flatter than this (cosine from the vertical) is a floor; steeper than WALL_MAX_UP is a wall.
+FLOOR_MIN_UP = 0.3
+WALL_MAX_UP = 0.5
+# A wall probe closer than this to a probe that stands already would tell nothing new.
+WALL_MIN_DISTANCE_M = 3.0
+SAME_PLACE_M = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """Probes of one sector, those that matter most first.
+
+    position : (P, 3) float64 [m], world frame
+    flags : (P,) uint8, bits of gi_core.sector
+    room : (P,) uint16
+    dead : candidates inside solids; dropped : probes beyond MAX_PROBES_PER_SECTOR
+    """
+
+    position: Float64
+    flags: UInt8
+    room: UInt16
+    dead: int
+    dropped: int
+
+
+def place_probes(
+    ray_scene: RayScene, bounds: Float64, index: SectorIndex, settings: BakeSettings, rooms: tuple[Room, ...], hints: tuple[ProbeHint, ...]
+) -> Placement:
+    """Probes for a sector. ``bounds`` (2, 3) [m] are the whole scene's."""
+    low = index.origin[[0, 2]] - settings.margin_m
+    high = index.origin[[0, 2]] + SECTOR_SIZE_M + settings.margin_m
+    ground = _ground_candidates(ray_scene, bounds, low, high, settings)
+    wall = _wall_candidates(ray_scene, bounds, low, high, settings)
+    asked = _asked_candidates(hints, low, high)
+    position = np.concatenate([asked, ground, wall])
+    flags = np.repeat(np.array([0, PROBE_ON_GROUND, PROBE_ON_WALL], np.uint8), [len(asked), len(ground), len(wall)])
+
+    allowed = ~_in_boxes(position, [h for h in hints if h.kind == "forbid"])
+    position, flags = position[allowed], flags[allowed]
+    room = room_of(position, rooms)
+    # An authored room is air, whatever way its walls were modelled.
+    dead = inside_solid(ray_scene, position) & (room == ROOM_OUTDOORS)
+    position, flags, room = position[~dead], flags[~dead], room[~dead]
+    kept = _thin(position, flags)
+    position, flags, room = position[kept], flags[kept], room[kept]
+
+    origin = index.origin[[0, 2]]
+    in_sector = ((position[:, [0, 2]] >= origin) & (position[:, [0, 2]] < origin + SECTOR_SIZE_M)).all(axis=1)
+    flags = np.where(in_sector, flags, flags | PROBE_IN_MARGIN).astype(np.uint8)
+    # Within its own sector first, the ground before walls, low before high; then a fixed order of place.
+    order = np.lexsort((position[:, 0], position[:, 2], position[:, 1], flags & PROBE_ON_WALL, flags & PROBE_IN_MARGIN))
+    chosen = np.sort(order[:MAX_PROBES_PER_SECTOR])
+    position, flags, room = position[chosen], flags[chosen], room[chosen]
+    # Stored along a curve of place, so that neighbours in memory are neighbours in space: their factors compress and cache well.
+    order = np.lexsort((position[:, 1], position[:, 0] // 8, position[:, 2] // 8))
+    return Placement(position[order], flags[order], room[order], int(dead.sum()), max(0, len(in_sector) - MAX_PROBES_PER_SECTOR))
+
+
+def room_of(position: Float64, rooms: tuple[Room, ...]) -> UInt16:
+    """Number of the first room that holds each position (n, 3) [m], counting from 1; 0 outdoors."""
+    room = np.full(len(position), ROOM_OUTDOORS, np.uint16)
+    for number in range(len(rooms), 0, -1):
+        box = rooms[number - 1]
+        room[((position >= box.minimum) & (position <= box.maximum)).all(axis=1)] = number
+    return room
+
+
+def _lattice(low: float, high: float, spacing: float) -> Float64:
+    """Multiples of the spacing plus one half of it within [low, high)."""
+    first, last = (int(np.ceil(edge / spacing - 0.5)) for edge in (low, high))
+    return (np.arange(first, last) + 0.5) * spacing
+
+
+def _march(ray_scene: RayScene, origins: Float64, direction: tuple[float, float, float], reach: float) -> tuple[Float64, Float64]:
+    """All surfaces that rays meet within ``reach`` [m] of their origins: positions (n, 3) and face-forwarded normals (n, 3)."""
+    ray = np.array(direction)
+    position = np.array(origins, np.float64)
+    left = np.full(len(position), reach)
+    found: list[tuple[Float64, Float64]] = []
+    for _ in range(MAX_LAYERS):
+        if len(position) == 0:
+            break
+        hits = ray_scene.closest(position, np.tile(ray.astype(np.float32), (len(position), 1)))
+        going = hits.hit & (hits.distance < left)
+        distance = hits.distance[going].astype(np.float64)
+        at = position[going] + ray * distance[:, None]
+        found.append((at, hits.normal[going].astype(np.float64)))
+        position = at + ray * SURFACE_OFFSET_M * 2
+        left = left[going] - distance
+    positions = np.concatenate([np.empty((0, 3)), *[p for p, _ in found]])
+    return positions, np.concatenate([np.empty((0, 3)), *[n for _, n in found]])
+
+
+def _ground_candidates(ray_scene: RayScene, bounds: Float64, low: Float64, high: Float64, settings: BakeSettings) -> Float64:
+    x_line, z_line = (_lattice(low[a], high[a], settings.grid_spacing_m) for a in (0, 1))
+    z, x = (a.ravel() for a in np.meshgrid(z_line, x_line, indexing="ij"))
+    top = np.stack([x, np.full_like(x, bounds[1, 1] + 10.0), z], axis=1)
+    at, normal = _march(ray_scene, top, (0.0, -1.0, 0.0), bounds[1, 1] - bounds[0, 1] + 20.0)
+    at = at[normal[:, 1] >= FLOOR_MIN_UP]
+    up = np.tile(np.array([[0, 1, 0]], np.float32), (len(at), 1))
+    above = ray_scene.closest(at + np.array([0, SURFACE_OFFSET_M, 0]), up)
+    free = np.minimum(above.distance, 1e6).astype(np.float64)
+    roomy = free >= settings.head_room_m
+    height = np.minimum(settings.probe_height_m, free[roomy] / 2)
+    position = at[roomy].copy()
+    position[:, 1] += height
+    return position
+
+
+def _wall_levels(bounds: Float64, settings: BakeSettings) -> Float64:
+    """Heights [m] at which walls are searched: evenly spaced near the ground, then at doubling distances."""
+    height, levels = settings.wall_spacing_m / 2, []
+    while bounds[0, 1] + height < bounds[1, 1]:
+        levels.append(bounds[0, 1] + height)
+        near_ground = height + settings.wall_spacing_m <= settings.wall_doubling_m
+        height += settings.wall_spacing_m if near_ground else max(height, settings.wall_spacing_m)
+    return np.array(levels)
+
+
+def _wall_candidates(ray_scene: RayScene, bounds: Float64, low: Float64, high: Float64, settings: BakeSettings) -> Float64:
+    levels = _wall_levels(bounds, settings)
+    found = []
+    for axis, other in ((0, 1), (1, 0)):
+        y, line = (a.ravel() for a in np.meshgrid(levels, _lattice(low[other], high[other], settings.wall_spacing_m), indexing="ij"))
+        for sign in (1.0, -1.0):
+            start = np.empty((len(y), 3))
+            start[:, 1] = y
+            start[:, 2 * other] = line
+            start[:, 2 * axis] = low[axis] if sign > 0 else high[axis]
+            direction = (sign, 0.0, 0.0) if axis == 0 else (0.0, 0.0, sign)
+            at, normal = _march(ray_scene, start, direction, high[axis] - low[axis])
+            wall = np.abs(normal[:, 1]) < WALL_MAX_UP
+            found.append((at[wall], normal[wall]))
+    at = np.concatenate([p for p, _ in found])
+    normal = np.concatenate([n for _, n in found])
+    air = ray_scene.closest(at + normal * SURFACE_OFFSET_M, normal.astype(np.float32))
+    # In a gap narrower than twice the offset the probe stands in the middle.
+    offset = np.minimum(settings.wall_offset_m, np.minimum(air.distance, 1e6) / 2)
+    fits = offset > 0.3
+    position = at[fits] + normal[fits] * offset[fits, None]
+    inside = ((position[:, [0, 2]] >= low) & (position[:, [0, 2]] < high)).all(axis=1)
+    return position[inside]
+
+
+def _asked_candidates(hints: tuple[ProbeHint, ...], low: Float64, high: Float64) -> Float64:
+    boxes = [np.empty((0, 3))]
+    for hint in hints:
+        if hint.kind != "add":
+            continue
+        x, y, z = (
+            _lattice(max(hint.minimum[a], bound_low), min(hint.maximum[a], bound_high), hint.spacing_m)
+            for a, bound_low, bound_high in ((0, low[0], high[0]), (1, -np.inf, np.inf), (2, low[1], high[1]))
+        )
+        boxes.append(np.stack([a.ravel() for a in np.meshgrid(x, y, z, indexing="ij")], axis=1))
+    return np.concatenate(boxes)
+
+
+def _in_boxes(position: Float64, boxes: list[ProbeHint]) -> Bool:
+    inside = np.zeros(len(position), bool)
+    for box in boxes:
+        inside |= ((position >= box.minimum) & (position <= box.maximum)).all(axis=1)
+    return inside
+
+
+def _thin(position: Float64, flags: UInt8) -> Bool:
+    """Which probes stay: none stands in the place of an earlier one, no wall probe stands close to any."""
+    kept = np.ones(len(position), bool)
+    if len(position) < 2:
+        return kept
+    near = cKDTree(position).query_pairs(WALL_MIN_DISTANCE_M, output_type="ndarray")
+    near = near[np.lexsort((near[:, 0], near[:, 1]))]
+    distance = np.linalg.norm(position[near[:, 0]] - position[near[:, 1]], axis=1)
+    too_close = distance < np.where(flags[near[:, 1]] & PROBE_ON_WALL, WALL_MIN_DISTANCE_M, SAME_PLACE_M)
+    for earlier, later in near[too_close]:
+        if kept[earlier]:
+            kept[later] = False
+    return kept

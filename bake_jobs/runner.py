@@ -1,0 +1,245 @@
+"""Bakes a whole dataset: several processes, a progress bar, nothing lost when it is interrupted.
+
+Each sector is a pure function of scene, settings and index, and is written whole or not at all. A bake's id names its input and
+settings in every sector file, so a bake that is started again skips what an earlier run of the same bake finished.
+"""
+
+import hashlib
+import json
+import multiprocessing
+import os
+import shutil
+import signal
+import tempfile
+import time
+from collections.abc import Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from bake_jobs.config import BakeSettings, settings_for
+from bake_jobs.geometry_clip import SectorCutter
+from bake_jobs.scene import Scene
+from bake_jobs.scene_source import load_scene, scene_digest
+from bake_jobs.sector_job import SKY_FACES, SectorBaker
+from bake_jobs.summary import print_summary
+from gi_core import distant_file, sector_file
+from gi_core.container import write_atomic
+from gi_core.dataset import DISTANT_FILE, WORLD_FILE, SectorFacts, WorldInfo, geometry_path, sector_path, write_world
+from gi_core.errors import FormatError, InputError, SectorlightError
+from gi_core.grid import SectorIndex
+from gi_core.sun_table import SunTable
+
+# Part of the bake id: raised whenever the same settings would give other bytes than before.
+BAKER_VERSION = 1
+SectorRange = tuple[tuple[int, int], tuple[int, int]]
+
+
+class WorkerLostError(SectorlightError, RuntimeError):
+    """A worker process died, most likely for want of memory."""
+
+    code = "worker_lost"
+
+
+@dataclass(frozen=True)
+class _Finished:
+    index: SectorIndex
+    facts: SectorFacts
+    distant_sky: list[float]
+    seconds: float
+
+
+def bake(
+    source: str,
+    output: Path,
+    quality: str = "talk",
+    jobs: int | None = None,
+    sectors: SectorRange | None = None,
+    seed: int = 0,
+    restart: bool = False,
+    console: Console | None = None,
+) -> WorldInfo:
+    """Bake a source into a dataset folder and print a summary.
+
+    jobs : worker processes; None takes every core. sectors : half-open ranges ((x0, x1), (z0, z1)); None takes all.
+    restart : bake everything anew instead of skipping finished sectors. seed : recorded with the dataset.
+
+    Raises InputError (SourceError among them) for input that cannot be baked, WorkerLostError when a worker dies. An interrupt
+    leaves finished sectors in place, and the same call resumes.
+    """
+    console = console or Console(stderr=True)
+    settings = settings_for(quality)
+    scene = load_scene(source)
+    table = SunTable.build(scene.location, settings.sun_declination_step_degrees, settings.sun_hour_step_degrees)
+    bake_id = _bake_id(scene, settings, seed)
+    wanted = _chosen(SectorCutter(scene).sectors(), sectors)
+    if restart:
+        _clear(output)
+    done = {i: f for i in wanted if (f := _finished(output, i, bake_id)) is not None}
+    remaining = [i for i in wanted if i not in done]
+    if done:
+        console.print(f"{len(done)} of {len(wanted)} sectors are finished already; baking the other {len(remaining)}")
+    workers = max(1, min(jobs or os.cpu_count() or 1, len(remaining)))
+    started = time.perf_counter()
+    if remaining:
+        # A world.json names a complete bake; while this one runs there is none.
+        (output / WORLD_FILE).unlink(missing_ok=True)
+        with Progress(
+            TextColumn("baking {task.fields[preset]}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(),
+            console=console,
+        ) as progress:
+            task = progress.add_task("bake", total=len(wanted), completed=len(done), preset=settings.preset)
+            for finished in _run(scene, settings, table, bake_id, output, remaining, workers):
+                done[finished.index] = finished
+                progress.advance(task)
+    wall_seconds = time.perf_counter() - started
+    write_atomic(output / DISTANT_FILE, distant_file.encode(distant_file.assemble({i: f.distant_sky for i, f in done.items()})))
+    world = WorldInfo(
+        name=scene.name,
+        source=Path(source).name if Path(source).exists() else source,
+        bake_id=bake_id,
+        location=scene.location,
+        bounds=scene.bounds,
+        preset=settings.preset,
+        basis=settings.basis,
+        sky_patches=SKY_FACES,
+        settings=settings.to_json(),
+        seed=seed,
+        sun_table=table,
+        sectors={i: done[i].facts for i in wanted},
+        rooms=scene.rooms,
+        lamps=scene.lamps,
+        dropped_triangles=asdict(scene.dropped),
+    )
+    write_world(output, world)
+    print_summary(console, world, sum(f.seconds for f in done.values()), wall_seconds, len(remaining), workers)
+    return world
+
+
+def _bake_id(scene: Scene, settings: BakeSettings, seed: int) -> str:
+    h = hashlib.blake2b(digest_size=16)
+    record = {
+        "scene": scene_digest(scene),
+        "settings": settings.to_json(),
+        "seed": seed,
+        "baker": BAKER_VERSION,
+        "format": sector_file.VERSION,
+    }
+    h.update(json.dumps(record, sort_keys=True).encode())
+    return h.hexdigest()
+
+
+def _chosen(available: list[SectorIndex], sectors: SectorRange | None) -> list[SectorIndex]:
+    if sectors is None:
+        return available
+    (x0, x1), (z0, z1) = sectors
+    chosen = [i for i in available if x0 <= i.x < x1 and z0 <= i.z < z1]
+    if not chosen:
+        xs, zs = [i.x for i in available], [i.z for i in available]
+        raise InputError(
+            f"--sectors={x0}:{x1},{z0}:{z1} holds no sector of this source; it has x {min(xs)}:{max(xs) + 1}, z {min(zs)}:{max(zs) + 1}"
+        )
+    return chosen
+
+
+def _clear(output: Path) -> None:
+    """Remove what a bake writes, and nothing else that the folder may hold."""
+    for name in ("sectors", "geometry"):
+        shutil.rmtree(output / name, ignore_errors=True)
+    for name in (WORLD_FILE, DISTANT_FILE):
+        (output / name).unlink(missing_ok=True)
+
+
+def _facts(sector_bytes: bytes, geometry_bytes: int, meta: dict[str, Any]) -> SectorFacts:
+    counted = {name: int(meta[name]) for name in SectorFacts.__dataclass_fields__ if name not in ("bytes", "digest", "geometry_bytes")}
+    digest = hashlib.blake2b(sector_bytes, digest_size=16).hexdigest()
+    return SectorFacts(bytes=len(sector_bytes), digest=digest, geometry_bytes=geometry_bytes, **counted)
+
+
+def _finished(output: Path, index: SectorIndex, bake_id: str) -> _Finished | None:
+    """A sector of this very bake that an earlier run completed, or None."""
+    path, geometry = sector_path(output, index), geometry_path(output, index)
+    if not path.is_file() or not geometry.is_file():
+        return None
+    data = path.read_bytes()
+    try:
+        sector, meta = sector_file.decode(data, str(path))
+        if sector.index != index or meta["bake_id"] != bake_id:
+            return None
+        return _Finished(index, _facts(data, geometry.stat().st_size, meta), meta["distant_sky"], 0.0)
+    except (FormatError, KeyError, TypeError, ValueError):
+        return None  # damaged: bake it again
+
+
+_baker: SectorBaker | None = None
+_output = Path()
+
+
+def _start_worker(arrays_path: Path, scene: Scene, settings: BakeSettings, table: SunTable, bake_id: str, output: Path) -> None:
+    """Build what all sectors of a worker share. Ctrl-C is the parent's to handle: a worker finishes its sector."""
+    global _baker, _output  # noqa: PLW0603 - a process pool's initialiser has no other place to leave what its tasks share
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if arrays_path.exists():
+        with np.load(arrays_path, allow_pickle=False) as arrays:
+            scene = Scene(**{**scene.__dict__, **{name: arrays[name] for name in arrays.files}})
+    _baker = SectorBaker(scene, settings, table.directions, bake_id)
+    _output = output
+
+
+def _bake_one(index: SectorIndex) -> _Finished:
+    assert _baker is not None
+    started = time.process_time()
+    baked = _baker.bake(index)
+    write_atomic(geometry_path(_output, index), baked.geometry_bytes)
+    # The sector file comes last: where it is, both are.
+    write_atomic(sector_path(_output, index), baked.sector_bytes)
+    facts = _facts(baked.sector_bytes, len(baked.geometry_bytes), baked.meta)
+    return _Finished(index, facts, baked.meta["distant_sky"], time.process_time() - started)
+
+
+def _run(
+    scene: Scene, settings: BakeSettings, table: SunTable, bake_id: str, output: Path, remaining: list[SectorIndex], workers: int
+) -> Iterator[_Finished]:
+    """Bake sectors in worker processes, in whatever order they finish."""
+    names = ("vertices", "triangles", "albedo", "emission")
+    empty = Scene(**{**scene.__dict__, **{n: getattr(scene, n)[:0] for n in names}})
+    with tempfile.TemporaryDirectory(prefix="sectorlight-") as folder:
+        arrays_path = Path(folder) / "scene.npz"
+        np.savez(arrays_path, **{n: getattr(scene, n) for n in names})
+        pool = ProcessPoolExecutor(
+            workers,
+            # A forked child would inherit the parent's threads' locks.
+            mp_context=multiprocessing.get_context("spawn"),
+            initializer=_start_worker,
+            initargs=(arrays_path, empty, settings, table, bake_id, output),
+        )
+        queue = iter(remaining)
+        pending: set[Future[_Finished]] = set()
+        try:
+            # A few tasks ahead of the workers, so that an interrupt has little to wait for.
+            for index in queue:
+                pending.add(pool.submit(_bake_one, index))
+                if len(pending) < 2 * workers:
+                    continue
+                finished, pending = wait(pending, return_when=FIRST_COMPLETED)
+                yield from (future.result() for future in finished)
+            while pending:
+                finished, pending = wait(pending, return_when=FIRST_COMPLETED)
+                yield from (future.result() for future in finished)
+        except BrokenProcessPool as error:
+            raise WorkerLostError(
+                "a worker process was killed (most likely: out of memory); finished sectors are kept, start the same bake again with fewer --jobs"
+            ) from error
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)

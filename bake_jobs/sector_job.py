@@ -1,0 +1,109 @@
+"""One sector, baked: a pure function of scene, settings, seed and index. Any process gives the same bytes."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bake_jobs import factors, gbuffer, placement, sun_visibility, surfels, voxels
+from bake_jobs.config import BakeSettings
+from bake_jobs.geometry_clip import SectorCutter
+from bake_jobs.rays import RayScene
+from bake_jobs.scene import Scene
+from gi_core import geometry_file, sector_file
+from gi_core.arrays import Float32, Float64
+from gi_core.constants import ALBEDO_MAX, ROOM_OUTDOORS
+from gi_core.geometry_file import Geometry
+from gi_core.grid import SectorIndex
+from gi_core.sector import PROBE_IN_MARGIN, Sector
+
+SKY_FACES = 6  # sky="faces": the talk's six scalars, one patch for each cube face
+
+
+@dataclass(frozen=True, eq=False)
+class BakedSector:
+    """A sector's two files and what the summary says of it."""
+
+    index: SectorIndex
+    sector_bytes: bytes
+    geometry_bytes: bytes
+    meta: dict[str, Any]
+
+
+class SectorBaker:
+    """Bakes sectors of one scene; what they share is built once."""
+
+    def __init__(self, scene: Scene, settings: BakeSettings, sun_directions: Float64, bake_id: str) -> None:
+        """``sun_directions`` (D, 3), unit, world frame; ``bake_id`` identifies scene and settings in every file."""
+        self._scene = scene
+        self._settings = settings
+        self._sun_directions = sun_directions
+        self._bake_id = bake_id
+        self._rays = RayScene(scene.vertices, scene.triangles)
+        self._cutter = SectorCutter(scene)
+        self._pattern = gbuffer.cube_map_pattern(settings.rays_per_face_edge)
+
+    def bake(self, index: SectorIndex) -> BakedSector:
+        """Both files of one sector."""
+        geometry = self._cutter.cut(index)
+        sector, meta = self.bake_arrays(index, geometry)
+        return BakedSector(index, sector_file.encode(sector, meta, SKY_FACES), geometry_file.encode(index, geometry), meta)
+
+    def bake_arrays(self, index: SectorIndex, geometry: Geometry) -> tuple[Sector, dict[str, Any]]:
+        """One sector's arrays before quantisation, and its meta. ``geometry`` is what SectorCutter.cut gives for it."""
+        scene, settings, rays = self._scene, self._settings, self._rays
+        placed = placement.place_probes(rays, scene.bounds, index, settings, scene.rooms, scene.hints)
+        seen = gbuffer.render(rays, placed.position, self._pattern)
+        clustered = surfels.cluster(seen, index.origin, scene.albedo, scene.emission)
+        weights = factors.gather(seen, self._pattern, clustered)
+        feedback_probe, feedback_weight = surfels.feedback(clustered, seen, settings.feedback_probes)
+        heights = geometry.vertices[:, 1] if len(geometry.vertices) else np.zeros(1)
+        lattice = voxels.bake_voxels(rays, np.array([heights.min(), heights.max()]), index, placed, settings, scene.rooms)
+        emits = bool(clustered.emission.any())
+        sector = Sector(
+            index=index,
+            probe_position=(placed.position - index.origin).astype(np.float32),
+            probe_flags=placed.flags,
+            probe_room=placed.room,
+            factor_starts=weights.starts,
+            factor_source=weights.source,
+            factor_weight=weights.weight,
+            brick_starts=clustered.brick_starts.astype(np.uint32),
+            brick_cell=clustered.brick_cell,
+            brick_direction=clustered.brick_direction,
+            surfel_position=clustered.position.astype(np.float32),
+            surfel_normal=clustered.normal,
+            surfel_albedo=np.minimum(clustered.albedo, np.float32(ALBEDO_MAX)),
+            surfel_snow=sun_visibility.bake_snow(rays, clustered, index.origin),
+            surfel_emission=clustered.emission if emits else None,
+            feedback_probe=feedback_probe,
+            feedback_weight=feedback_weight,
+            sun_visibility=sun_visibility.bake_visibility(rays, clustered, index.origin, self._sun_directions),
+            voxel_first=lattice.first,
+            voxel_class=lattice.kind,
+            voxel_room=lattice.room,
+            voxel_probe=lattice.probe,
+            voxel_weight=lattice.weight,
+        )
+        meta = {
+            "bake_id": self._bake_id,
+            "probes": sector.probe_count,
+            "factors": sector.factor_count,
+            "bricks": sector.brick_count,
+            "surfels": sector.surfel_count,
+            "voxels": int(lattice.kind.size),
+            "triangles": len(geometry.triangles),
+            "probes_dead": placed.dead,
+            "probes_dropped": placed.dropped,
+            "voxels_blind": lattice.blind,
+            "distant_sky": _distant_sky(weights.sky, placed),
+        }
+        return sector, meta
+
+
+def _distant_sky(sky: Float32, placed: placement.Placement) -> list[float]:
+    """Mean sky factor of each cube face over a sector's outdoor probes: its distant texel (slide "Distant shading")."""
+    chosen = (placed.room == ROOM_OUTDOORS) & (placed.flags & PROBE_IN_MARGIN == 0)
+    if not chosen.any():
+        return [0.0] * 6
+    return [round(float(v), 5) for v in sky[chosen].mean(axis=0, dtype=np.float64)]

@@ -1,0 +1,120 @@
+"""Clusters what probes see into surfels and bricks (slides "Surfel sharing", "Surfel grid"): a two-level hash grid.
+
+A hit's key names its 4 m brick cell, its principal normal direction, and its 1 m cell inside the brick, in that order of
+significance. Sorting by the key therefore sorts surfels by brick, and a brick is a run of surfels:
+
+    key = [brick y | brick z | brick x | direction | cell in brick]
+            16 bit    16 bit    16 bit    3 bit        6 bit
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bake_jobs.gbuffer import GBuffer
+from gi_core.arrays import Float32, Float64, Int32, Int64, UInt8, UInt16
+from gi_core.constants import BRICK_CELL_M, SURFEL_CELL_M
+from gi_core.errors import SourceError
+
+CELLS_PER_BRICK = round(BRICK_CELL_M / SURFEL_CELL_M)
+# Walls and floors love whole metres. Moved this far off the surface, all their hits fall into one layer of cells, and the two faces
+# of a thin wall into different ones.
+KEY_OFFSET_M = 0.02
+_HALF_RANGE = 1 << 15
+
+
+@dataclass(frozen=True, eq=False)
+class Surfels:
+    """Surfels in brick order; gi_core.sector describes the arrays.
+
+    of_hit : (h,) int64, the surfel of each hit, and hit : (h,) int64, the G-buffer entry of each
+    """
+
+    position: Float64
+    normal: Float32
+    albedo: Float32
+    emission: Float32
+    brick_starts: Int64
+    brick_cell: Int32
+    brick_direction: UInt8
+    of_hit: Int64
+    hit: Int64
+
+    @property
+    def count(self) -> int:
+        return len(self.position)
+
+    @property
+    def brick_of_surfel(self) -> Int64:
+        """(S,) int64."""
+        return np.repeat(np.arange(len(self.brick_cell)), np.diff(self.brick_starts))
+
+
+def principal_direction(normal: Float32) -> UInt8:
+    """Ambient cube face (n,) that each normal (n, 3) is closest to."""
+    axis = np.argmax(np.abs(normal), axis=1)
+    negative = np.take_along_axis(normal, axis[:, None], axis=1)[:, 0] < 0
+    return (2 * axis + negative).astype(np.uint8)
+
+
+def cluster(gbuffer: GBuffer, origin: Float64, albedo: Float32, emission: Float32) -> Surfels:
+    """Group a sector's hits into surfels and bricks. ``origin`` (3,) is the sector's; albedo and emission (m, 3) are the triangles'."""
+    hit = np.flatnonzero(gbuffer.hits.hit)
+    local = gbuffer.position[hit] - origin
+    normal = gbuffer.hits.normal[hit]
+    direction = principal_direction(normal)
+    cell = np.floor((local + normal * KEY_OFFSET_M) / SURFEL_CELL_M).astype(np.int64)
+    brick = cell // CELLS_PER_BRICK
+    if len(brick) and np.abs(brick).max() >= _HALF_RANGE:
+        raise SourceError(f"a probe sees a surface more than {_HALF_RANGE * BRICK_CELL_M:.0f} m away; split the world into parts")
+    within = cell - brick * CELLS_PER_BRICK
+    b = brick + _HALF_RANGE
+    key = (b[:, 1] << 16 | b[:, 2]) << 16 | b[:, 0]
+    key = (key << 3 | direction) << 6 | (within[:, 1] << 4 | within[:, 2] << 2 | within[:, 0])
+    surfel_key, of_hit, hits_of_surfel = np.unique(key, return_inverse=True, return_counts=True)
+    count = len(surfel_key)
+
+    def mean(values: Float64 | Float32) -> Float64:
+        columns = [np.bincount(of_hit, values[:, c], count) for c in range(3)]
+        return np.stack(columns, axis=1) / hits_of_surfel[:, None]
+
+    triangle = gbuffer.hits.triangle[hit]
+    mean_normal = mean(normal)
+    mean_normal /= np.maximum(np.linalg.norm(mean_normal, axis=1, keepdims=True), 1e-12)
+    brick_key, first = np.unique(surfel_key >> 6, return_index=True)
+    brick_cell = np.stack([brick_key >> 3 & 0xFFFF, brick_key >> 35 & 0xFFFF, brick_key >> 19 & 0xFFFF], axis=1) - _HALF_RANGE
+    return Surfels(
+        position=mean(local),
+        normal=mean_normal.astype(np.float32),
+        albedo=mean(albedo[triangle]).astype(np.float32),
+        emission=mean(emission[triangle]).astype(np.float32) if emission.any() else np.zeros((count, 3), np.float32),
+        brick_starts=np.append(first, count).astype(np.int64),
+        brick_cell=brick_cell.astype(np.int32),
+        brick_direction=(brick_key & 7).astype(np.uint8),
+        of_hit=of_hit.reshape(-1),
+        hit=hit,
+    )
+
+
+def feedback(surfels: Surfels, gbuffer: GBuffer, k: int) -> tuple[UInt16, Float32]:
+    """The k closest probes among those that see each surfel (slide "Multiple bounces"), and their weights by inverse distance.
+
+    -> (S, k) uint16 and (S, k) float32, rows sum to 1. Seeing it is what keeps a probe behind a wall from lighting a surfel.
+    """
+    probe = surfels.hit // gbuffer.rays
+    # One integer orders by distance, then by probe: millimetres up to 2 ** 52 / 1024, probes below 1024.
+    millimetres = np.minimum(gbuffer.hits.distance[surfels.hit].astype(np.float64) * 1000, 2.0**40).astype(np.int64)
+    code = millimetres << 10 | probe
+    taken = np.zeros((surfels.count, k), np.uint16)
+    weight = np.zeros((surfels.count, k), np.float64)
+    far = np.iinfo(np.int64).max
+    for slot in range(k):
+        best = np.full(surfels.count, far)
+        np.minimum.at(best, surfels.of_hit, code)
+        found = best != far
+        taken[:, slot] = np.where(found, best & 0x3FF, 0)
+        weight[:, slot] = np.where(found, 1 / np.maximum((best >> 10) / 1000.0, 0.25), 0)
+        if slot + 1 < k:
+            code = np.where(probe == taken[surfels.of_hit, slot], far, code)
+    weight /= np.maximum(weight.sum(axis=1, keepdims=True), 1e-30)
+    return taken, weight.astype(np.float32)

@@ -1,0 +1,129 @@
+"""Which probes a voxel of the irradiance volume blends: baked interpolation, so that no leak test is left for run time.
+
+A voxel in free air blends the closest probes that it sees; one that sees none (a floor, or light would end at a pillar) takes the
+closest of its room. A voxel in a solid blends what the nearest air blends, so that trilinear sampling at a wall never turns dark.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+from scipy.spatial import cKDTree
+
+from bake_jobs.config import BakeSettings
+from bake_jobs.gbuffer import inside_solid
+from bake_jobs.placement import Placement, room_of
+from bake_jobs.rays import SURFACE_OFFSET_M, RayScene
+from gi_core.arrays import Float32, Float64, Int32, Int64, UInt8, UInt16
+from gi_core.constants import ROOM_OUTDOORS, VOXEL_INDOORS, VOXEL_OUTDOORS, VOXEL_SIZE_M, VOXEL_SOLID
+from gi_core.grid import SectorIndex, voxel_centre, voxel_columns
+from gi_core.world import Room
+
+# Solid voxels at a border take the nearest air of this many columns beyond it too, as the neighbour's own would.
+FILL_MARGIN = 2
+# Air is stored this far above a sector's highest surface, and at least this far above its lowest: half a volume, for a player who
+# stands in the street.
+AIR_ABOVE_TOP_M = 4.0
+AIR_ABOVE_GROUND_M = 28.0
+
+
+@dataclass(frozen=True, eq=False)
+class Voxels:
+    """Arrays as gi_core.sector describes them, and ``blind``: how many free voxels see none of their closest probes."""
+
+    first: Int32
+    kind: UInt8
+    room: UInt16
+    probe: UInt16
+    weight: Float32
+    blind: int
+
+
+def bake_voxels(
+    ray_scene: RayScene, surfaces: Float64, index: SectorIndex, placement: Placement, settings: BakeSettings, rooms: tuple[Room, ...]
+) -> Voxels:
+    """Voxels of a sector. ``surfaces`` (2,) [m] are the lowest and highest surface in it."""
+    lattice, shape = _lattice(index, surfaces)
+    centre = voxel_centre(lattice.reshape(-1, 3))
+    room = room_of(centre, rooms)
+    kind = np.where(room == ROOM_OUTDOORS, VOXEL_OUTDOORS, VOXEL_INDOORS).astype(np.uint8)
+    outdoors = np.flatnonzero(room == ROOM_OUTDOORS)
+    kind[outdoors[inside_solid(ray_scene, centre[outdoors])]] = VOXEL_SOLID
+    probe, weight, blind = _blend(ray_scene, centre, kind, room, placement, settings)
+    source = _nearest_air(kind.reshape(shape))
+    probe, weight = probe[source], weight[source]
+
+    # The fill margin was only there to be read from.
+    inner = (slice(None), slice(FILL_MARGIN, -FILL_MARGIN), slice(FILL_MARGIN, -FILL_MARGIN))
+    k = settings.voxel_probes
+    return Voxels(
+        first=lattice[0, FILL_MARGIN, FILL_MARGIN].astype(np.int32),
+        kind=np.ascontiguousarray(kind.reshape(shape)[inner]),
+        room=np.ascontiguousarray(room.reshape(shape)[inner]),
+        probe=np.ascontiguousarray(probe.reshape(*shape, k)[inner]),
+        weight=np.ascontiguousarray(weight.reshape(*shape, k)[inner]),
+        blind=blind,
+    )
+
+
+def _lattice(index: SectorIndex, surfaces: Float64) -> tuple[Int64, tuple[int, int, int]]:
+    """Lattice indices (ny, nz, nx, 3) of a sector's voxels and the margin around them."""
+    x0, x1 = voxel_columns(index.x)
+    z0, z1 = voxel_columns(index.z)
+    y0 = int(np.floor(surfaces[0] / VOXEL_SIZE_M)) - 1
+    y1 = int(np.ceil(max(surfaces[1] + AIR_ABOVE_TOP_M, surfaces[0] + AIR_ABOVE_GROUND_M) / VOXEL_SIZE_M)) + 1
+    ranges = (np.arange(y0, y1), np.arange(z0 - FILL_MARGIN, z1 + FILL_MARGIN), np.arange(x0 - FILL_MARGIN, x1 + FILL_MARGIN))
+    y, z, x = np.meshgrid(*ranges, indexing="ij")
+    return np.stack([x, y, z], axis=-1), (len(ranges[0]), len(ranges[1]), len(ranges[2]))
+
+
+def _blend(
+    ray_scene: RayScene, centre: Float64, kind: UInt8, room: UInt16, placement: Placement, settings: BakeSettings
+) -> tuple[UInt16, Float32, int]:
+    """Probes (V, K) and weights (V, K) of all voxels; zero where a voxel is solid."""
+    k = settings.voxel_probes
+    probe = np.zeros((len(centre), k), np.uint16)
+    weight = np.zeros((len(centre), k), np.float32)
+    blind = 0
+    for number in np.unique(room):
+        members = np.flatnonzero((room == number) & (kind != VOXEL_SOLID))
+        available = np.flatnonzero(placement.room == number)
+        if len(available) == 0:
+            # A room without a probe of its own borrows from all: better than black.
+            available = np.arange(len(placement.position))
+        if len(members) == 0 or len(available) == 0:
+            continue
+        candidates = min(settings.voxel_candidates, len(available))
+        distance, near = cKDTree(placement.position[available]).query(centre[members], k=candidates)
+        distance, near = distance.reshape(len(members), candidates), available[near.reshape(len(members), candidates)]
+        sees = _visible(ray_scene, centre[members], placement.position[near], distance)
+        blind_member = ~sees.any(axis=1)
+        sees[blind_member, 0] = True
+        blind += int(blind_member.sum())
+        rank = np.cumsum(sees, axis=1)
+        share = np.where(sees & (rank <= k), 1 / np.maximum(distance, 0.25) ** 2, 0)
+        best = np.argsort(-share, axis=1, kind="stable")[:, :k]
+        rows = np.arange(len(members))[:, None]
+        probe[members, : best.shape[1]] = near[rows, best]
+        weight[members, : best.shape[1]] = share[rows, best] / share.sum(axis=1, keepdims=True)
+    probe[weight == 0] = 0
+    return probe, weight, blind
+
+
+def _visible(ray_scene: RayScene, centre: Float64, probes: Float64, distance: Float64) -> "np.ndarray[tuple[int, ...], np.dtype[np.bool_]]":
+    """(V, c) bool: nothing lies between each voxel centre (V, 3) and its candidates (V, c, 3)."""
+    voxels, candidates = distance.shape
+    reach = distance.reshape(-1)
+    offset = (probes - centre[:, None]).reshape(-1, 3)
+    direction = offset / np.maximum(reach, 1e-6)[:, None]
+    blocked = ray_scene.occluded(np.repeat(centre, candidates, axis=0), direction, reach - SURFACE_OFFSET_M)
+    return ~blocked.reshape(voxels, candidates)
+
+
+def _nearest_air(kind: UInt8) -> Int64:
+    """For each voxel (flat order), the flat index of the nearest that is not solid; its own where there is none."""
+    solid = kind == VOXEL_SOLID
+    if solid.all():
+        return np.arange(kind.size)
+    nearest = distance_transform_edt(solid, return_distances=False, return_indices=True)
+    return np.ravel_multi_index(tuple(nearest), kind.shape).reshape(-1)

@@ -1,0 +1,190 @@
+"""Sector <-> bytes of a ``.gisec`` file. FORMAT.md describes each array; the two functions here mirror each other."""
+
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gi_core import container, quantise
+from gi_core.arrays import AnyArray, Float32, UInt8
+from gi_core.constants import BRICK_CELL_M
+from gi_core.container import Container
+from gi_core.errors import CorruptFileError
+from gi_core.grid import SectorIndex
+from gi_core.sector import Sector, check_sector, counts, starts
+
+KIND = "SECT"
+VERSION = 1
+NO_PROBE = 0xFFFF
+# A cell's 4 m are divided into 256 steps of 1.6 cm.
+_CELL_STEPS = 256
+
+
+def encode(sector: Sector, meta: dict[str, Any], sky_patches: int) -> bytes:
+    """Bytes of a sector file. ``meta`` is any JSON object: the baker's fingerprint, counts and report."""
+    s = sector
+    weight_codes, weight_scales = _encode_weights(s)
+    cell_of_surfel = np.repeat(s.brick_cell, counts(s.brick_starts), axis=0)
+    in_cell = np.floor((s.surfel_position.astype(np.float64) / BRICK_CELL_M - cell_of_surfel) * _CELL_STEPS)
+    feedback = np.where(s.feedback_weight > 0, s.feedback_probe, NO_PROBE).astype(np.uint16)
+    arrays: dict[str, AnyArray] = {
+        "probe_position": quantise.encode_length(s.probe_position).T,
+        "probe_flags": s.probe_flags,
+        "probe_room": quantise.smallest_unsigned(s.probe_room),
+        "factor_count": counts(s.factor_starts).astype(np.uint16),
+        "factor_source": s.factor_source.astype(np.uint32),
+        "factor_weight": weight_codes,
+        "factor_scale": weight_scales,
+        "brick_count": counts(s.brick_starts).astype(np.uint16),
+        "brick_cell": s.brick_cell.T.astype(np.int32),
+        "brick_direction": s.brick_direction,
+        "surfel_in_cell": np.clip(in_cell, 0, _CELL_STEPS - 1).astype(np.uint8).T,
+        "surfel_normal": quantise.encode_unit(s.surfel_normal),
+        "surfel_albedo": quantise.encode_root(s.surfel_albedo).T,
+        "surfel_snow": quantise.encode_fraction(s.surfel_snow),
+        "feedback_probe": feedback.T,
+        "sun_visibility": s.sun_visibility,
+        "voxel_class": s.voxel_class,
+        "voxel_room": quantise.smallest_unsigned(s.voxel_room),
+        "voxel_probe": np.moveaxis(s.voxel_probe, 3, 0),
+        "voxel_weight": np.moveaxis(quantise.encode_fraction(s.voxel_weight), 3, 0),
+    }
+    if s.feedback_probe.shape[1] > 1:
+        arrays["feedback_weight"] = quantise.encode_fraction(s.feedback_weight).T
+    if s.surfel_emission is not None:
+        arrays["surfel_emission"] = s.surfel_emission.astype(np.float32).T
+    full_meta = {
+        "sector": [s.index.x, s.index.z],
+        "sky_patches": sky_patches,
+        "voxel_first": [int(v) for v in s.voxel_first],
+        "bake": meta,
+    }
+    delta = frozenset({"probe_position", "factor_source", "brick_cell", "voxel_probe"})
+    return container.encode(KIND, VERSION, full_meta, arrays, delta)
+
+
+def decode(data: bytes, where: str) -> tuple[Sector, dict[str, Any]]:
+    """A sector and its baker's meta, every count, range and index checked. Raises CorruptFileError or FormatVersionError."""
+    found = container.decode(data, KIND, VERSION, where)
+    try:
+        sector = _sector(found)
+        check_sector(sector, int(found.meta["sky_patches"]))
+        return sector, dict(found.meta["bake"])
+    except CorruptFileError as error:
+        raise CorruptFileError(f"{where}: {error}") from error
+    except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
+        raise CorruptFileError(f"{where}: inconsistent contents ({type(error).__name__}: {error}); bake it again") from error
+
+
+def read(path: Path) -> tuple[Sector, dict[str, Any]]:
+    """A sector file from disk, as ``decode``."""
+    return decode(path.read_bytes(), str(path))
+
+
+def quantised(sector: Sector, sky_patches: int) -> Sector:
+    """The sector as a reader will see it: what the file's precision leaves of it."""
+    return decode(encode(sector, {}, sky_patches), f"sector {sector.index}")[0]
+
+
+def same_arrays(a: Sector, b: Sector) -> bool:
+    """Whether two sectors hold the same bytes."""
+    for field in fields(Sector):
+        x, y = getattr(a, field.name), getattr(b, field.name)
+        if isinstance(x, np.ndarray) != isinstance(y, np.ndarray) or (isinstance(x, np.ndarray) and not np.array_equal(x, y)):
+            return False
+    return a.index == b.index
+
+
+def _is_sky(s: Sector) -> AnyArray:
+    return s.factor_source >= s.brick_count
+
+
+def _probe_of_factor(factor_starts: AnyArray) -> AnyArray:
+    return np.repeat(np.arange(len(factor_starts) - 1), counts(factor_starts))
+
+
+def _encode_weights(s: Sector) -> tuple[UInt8, AnyArray]:
+    """Factor weights as uint8 (B, F) codes of their square root, and float16 (2, B, P) scales for bricks and sky.
+
+    A scale is chosen so that each probe's weights still sum to what they did: rounding 8-bit weights moves light between a
+    probe's bricks, but neither makes nor loses any.
+    """
+    basis, probes = s.basis_size, s.probe_count
+    row = _is_sky(s) * probes + _probe_of_factor(s.factor_starts)  # bricks first, then sky
+    codes = np.zeros((basis, s.factor_count), np.uint8)
+    scales = np.zeros((2, basis, probes), np.float16)
+    for b in range(basis):
+        weight = s.factor_weight[:, b].astype(np.float64)
+        top = np.zeros(2 * probes)
+        np.maximum.at(top, row, weight)
+        codes[b] = quantise.encode_root(weight / np.maximum(top[row], 1e-30))
+        decoded = quantise.decode_root(codes[b]).astype(np.float64)
+        kept = np.bincount(row, decoded, 2 * probes)
+        total = np.bincount(row, weight, 2 * probes)
+        scales[:, b] = quantise.half_below(total / np.maximum(kept, 1e-30)).reshape(2, probes)
+    return codes, scales
+
+
+def _decode_weights(codes: AnyArray, scales: AnyArray, factor_starts: AnyArray, is_sky: AnyArray) -> Float32:
+    probe = _probe_of_factor(factor_starts)
+    scale = scales.astype(np.float32)[is_sky.astype(np.int64), :, probe]  # (F, B)
+    return np.ascontiguousarray(quantise.decode_root(codes).T * scale)
+
+
+def _sector(found: Container) -> Sector:
+    take = found.take
+    factor_starts, brick_starts = starts(take("factor_count", "u2", 1)), starts(take("brick_count", "u2", 1))
+    brick_cell = np.ascontiguousarray(take("brick_cell", "i4", 2).T)
+    source = take("factor_source", "u4", 1)
+    in_cell = take("surfel_in_cell", "u1", 2).T
+    # A wrong count would otherwise size the arrays that np.repeat makes.
+    if int(factor_starts[-1]) != len(source) or int(brick_starts[-1]) != len(in_cell) or len(brick_cell) != len(brick_starts) - 1:
+        raise CorruptFileError("counts per probe or brick do not add up")
+    cell_of_surfel = np.repeat(brick_cell, counts(brick_starts), axis=0)
+    position = (cell_of_surfel + (in_cell.astype(np.float64) + 0.5) / _CELL_STEPS) * BRICK_CELL_M
+    feedback = take("feedback_probe", "u2", 2).T
+    lit = feedback != NO_PROBE
+    if feedback.shape[1] > 1:
+        share = take("feedback_weight", "u1", 2).T * lit
+        feedback_weight = share / np.maximum(share.sum(axis=1, keepdims=True), 1)
+    else:
+        feedback_weight = lit
+    voxel_share = np.moveaxis(take("voxel_weight", "u1", 4), 0, 3).astype(np.float32)
+    voxel_weight = voxel_share / np.maximum(voxel_share.sum(axis=3, keepdims=True), 1)
+    emission = take("surfel_emission", "f4", 2).T if "surfel_emission" in found.arrays else None
+    index = found.meta["sector"]
+    return Sector(
+        index=SectorIndex(int(index[0]), int(index[1])),
+        probe_position=np.ascontiguousarray(quantise.decode_length(take("probe_position", "i4", 2).T), np.float32),
+        probe_flags=take("probe_flags", "u1", 1),
+        probe_room=_unsigned(found, "probe_room").astype(np.uint16),
+        factor_starts=factor_starts,
+        factor_source=source,
+        factor_weight=_decode_weights(
+            take("factor_weight", "u1", 2), take("factor_scale", "f2", 3), factor_starts, source >= len(brick_cell)
+        ),
+        brick_starts=brick_starts,
+        brick_cell=brick_cell,
+        brick_direction=take("brick_direction", "u1", 1),
+        surfel_position=np.ascontiguousarray(position, np.float32),
+        surfel_normal=quantise.decode_unit(take("surfel_normal", "u1", 2)),
+        surfel_albedo=np.ascontiguousarray(quantise.decode_root(take("surfel_albedo", "u1", 2)).T),
+        surfel_snow=take("surfel_snow", "u1", 1).astype(np.float32) / np.float32(255),
+        surfel_emission=None if emission is None else np.ascontiguousarray(emission),
+        feedback_probe=np.ascontiguousarray(np.where(lit, feedback, 0), np.uint16),
+        feedback_weight=np.ascontiguousarray(feedback_weight, np.float32),
+        sun_visibility=take("sun_visibility", "u4", 2),
+        voxel_first=np.array([int(v) for v in found.meta["voxel_first"]], np.int32),
+        voxel_class=take("voxel_class", "u1", 3),
+        voxel_room=_unsigned(found, "voxel_room").astype(np.uint16),
+        voxel_probe=np.ascontiguousarray(np.moveaxis(take("voxel_probe", "u2", 4), 0, 3)),
+        voxel_weight=np.ascontiguousarray(voxel_weight, np.float32),
+    )
+
+
+def _unsigned(found: Container, name: str) -> AnyArray:
+    values = found.arrays.get(name)
+    if values is None or values.dtype.kind != "u" or values.max(initial=0) > 0xFFFF:
+        raise CorruptFileError(f"array {name!r} of unsigned integers below 65536 is missing")
+    return values
