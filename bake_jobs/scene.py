@@ -1,10 +1,14 @@
 """What a bake reads: triangles with albedo and emission, and what a world.toml says about them."""
 
+import dataclasses
+import hashlib
+import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from gi_core.arrays import Float32, Float64, Int32
+from gi_core.arrays import Float32, Float64, Int32, Int64
 from gi_core.world import Lamp, Location, Room
 
 
@@ -25,6 +29,40 @@ class ProbeHint:
     minimum: tuple[float, float, float]
     maximum: tuple[float, float, float]
     spacing_m: float = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Triangles as a source gives them, not yet cleaned. World frame, metres.
+
+    vertices : (v, 3) float64 [m]
+    triangles : (m, 3) int64, indices that may be out of range
+    albedo : (m, 3) float32, linear sRGB, any value
+    emission : (m, 3) float32 [cd m^-2]
+    """
+
+    vertices: Float64
+    triangles: Int64
+    albedo: Float32
+    emission: Float32
+
+    @classmethod
+    def of_colour(cls, vertices: Float64, triangles: Int64, albedo: Float64 | Float32 | Sequence[float]) -> "Mesh":
+        """A mesh that gives no light; albedo is (3,) for all triangles or (m, 3)."""
+        colour = np.broadcast_to(np.asarray(albedo, np.float32), (len(triangles), 3)).copy()
+        return cls(vertices, triangles, colour, np.zeros((len(triangles), 3), np.float32))
+
+
+@dataclass(frozen=True, eq=False)
+class SourceContent:
+    """What one source file holds, before it is cleaned and joined with others. location is None when the source knows no place."""
+
+    mesh: Mesh
+    location: Location | None = None
+    rooms: tuple[Room, ...] = ()
+    lamps: tuple[Lamp, ...] = ()
+    hints: tuple[ProbeHint, ...] = ()
+    name: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,3 +90,40 @@ class Scene:
     def bounds(self) -> Float64:
         """(2, 3) float64 [m]: minimum and maximum of the vertices."""
         return np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+
+
+def join_meshes(meshes: Sequence[Mesh]) -> Mesh:
+    """One mesh of several. An index that was out of range in its own mesh stays out of range (-1)."""
+    triangles = []
+    first = 0
+    for mesh in meshes:
+        count = len(mesh.vertices)
+        in_range = (mesh.triangles >= 0) & (mesh.triangles < count)
+        triangles.append(np.where(in_range, mesh.triangles + first, -1))
+        first += count
+    if not meshes:
+        nothing = np.zeros((0, 3))
+        return Mesh(nothing, nothing.astype(np.int64), nothing.astype(np.float32), nothing.astype(np.float32))
+    return Mesh(
+        np.concatenate([mesh.vertices for mesh in meshes]).astype(np.float64),
+        np.concatenate(triangles).astype(np.int64),
+        np.concatenate([mesh.albedo for mesh in meshes]).astype(np.float32),
+        np.concatenate([mesh.emission for mesh in meshes]).astype(np.float32),
+    )
+
+
+def scene_digest(scene: Scene) -> str:
+    """32 hexadecimal digits that identify everything in a scene which a bake reads; its name and the dropped counts are left out."""
+    h = hashlib.blake2b(digest_size=16)
+    for values, dtype in (
+        (scene.vertices, np.dtype("<f8")),
+        (scene.triangles, np.dtype("<i4")),
+        (scene.albedo, np.dtype("<f4")),
+        (scene.emission, np.dtype("<f4")),
+    ):
+        h.update(repr(values.shape).encode())
+        h.update(np.ascontiguousarray(values, dtype).tobytes())
+    said = [dataclasses.asdict(item) for item in (scene.location, *scene.rooms, *scene.lamps, *scene.hints)]
+    counts = [len(scene.rooms), len(scene.lamps), len(scene.hints)]
+    h.update(json.dumps([counts, said], sort_keys=True, default=str).encode())
+    return h.hexdigest()

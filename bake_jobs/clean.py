@@ -1,0 +1,159 @@
+"""Make a source's triangles safe to bake: nothing non-finite, degenerate, doubled or inside-out. Never fatal while anything is left."""
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from bake_jobs.scene import DroppedTriangles, Mesh, Scene
+from gi_core.arrays import Bool, Float64, Int64
+from gi_core.constants import ALBEDO_MAX
+from gi_core.errors import SourceError
+from gi_core.world import Location, Room
+
+MAX_TRIANGLES = 50_000_000  # about 5 GB of scene; a city is a few million
+MAX_EXTENT_M = 1e6  # wider than this is a wrong unit or a stray vertex, not a city
+# A triangle whose doubled area is below this share of its longest edge squared is a line: its normal is rounding noise.
+DEGENERATE_RATIO = 1e-10
+# Nested shells are looked for among this many inside-out ones at a time, to bound memory.
+NESTING_CHUNK = 256
+
+
+def clean_mesh(mesh: Mesh, where: str, rooms: tuple[Room, ...] = ()) -> tuple[Mesh, DroppedTriangles]:
+    """Drop what cannot be baked, merge equal vertices, turn inside-out solids; say what was dropped.
+
+    Dropped are triangles with a NaN or infinite corner, colour or emission; with an index out of range or no area; and all but the
+    first of those with the same three corners, in any order, since surfaces are two-sided. The order of the rest is kept.
+    Raises SourceError, naming ``where``, when nothing is left, or what is left is too large to be a city.
+    """
+    _refuse_too_many(len(mesh.triangles), where)
+    in_range = ((mesh.triangles >= 0) & (mesh.triangles < len(mesh.vertices))).all(axis=1)
+    safe = np.where(in_range[:, None], mesh.triangles, 0) if len(mesh.vertices) else mesh.triangles[:0]
+    if not len(safe):
+        raise SourceError(f"{where}: expected triangles, found none; check that the file holds a mesh of surfaces")
+    finite_vertex = np.isfinite(mesh.vertices).all(axis=1)
+    finite = finite_vertex[safe].all(axis=1) & np.isfinite(mesh.albedo).all(axis=1) & np.isfinite(mesh.emission).all(axis=1)
+    finite |= ~in_range
+    vertices = np.where(finite_vertex[:, None], mesh.vertices, 0.0) + 0.0  # + 0.0 turns -0.0 into 0.0, its equal in all but bits
+    flat = ~in_range | _without_area(vertices, safe)
+    kept = np.flatnonzero(finite & ~flat)
+    if len(kept):
+        _refuse_absurd(vertices[np.unique(safe[kept])], where)
+    used, triangles = _merge_equal(vertices, safe[kept])
+    first = _first_of_equal(triangles)
+    kept, triangles = kept[first], triangles[first]
+    dropped = DroppedTriangles(
+        degenerate=int((finite & flat).sum()), duplicate=len(first) - int(first.sum()), non_finite=int((~finite).sum())
+    )
+    if not len(kept):
+        raise SourceError(f"{where}: expected triangles with an area, found none among {len(mesh.triangles)} ({dropped})")
+    turn = _inside_out(used, triangles, rooms)
+    triangles[turn] = triangles[turn][:, ::-1]
+    albedo = np.clip(mesh.albedo[kept], 0, ALBEDO_MAX).astype(np.float32)
+    return Mesh(used, triangles, albedo, np.maximum(mesh.emission[kept], 0).astype(np.float32)), dropped
+
+
+def scene_of(mesh: Mesh, dropped: DroppedTriangles, name: str, location: Location) -> Scene:
+    """A scene of a cleaned mesh."""
+    return Scene(mesh.vertices, mesh.triangles.astype(np.int32), mesh.albedo, mesh.emission, name, location, dropped=dropped)
+
+
+def _refuse_too_many(count: int, where: str) -> None:
+    if count > MAX_TRIANGLES:
+        raise SourceError(f"{where}: expected at most {MAX_TRIANGLES:,} triangles, found {count:,}; split the city into several bakes")
+
+
+def _refuse_absurd(vertices: Float64, where: str) -> None:
+    extent = np.ptp(vertices, axis=0)
+    if extent.max() > MAX_EXTENT_M:
+        raise SourceError(
+            f"{where}: expected a city at most {MAX_EXTENT_M:.0e} m across, found {extent.max():.3g} m; "
+            "check its unit and for stray vertices"
+        )
+
+
+def _without_area(vertices: Float64, triangles: Int64) -> Bool:
+    """(m,) whether each triangle is a line or a point."""
+    a, b, c = (vertices[triangles[:, i]] for i in range(3))
+    with np.errstate(over="ignore", invalid="ignore"):
+        doubled_area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        longest_squared = np.maximum(np.maximum(((b - a) ** 2).sum(1), ((c - a) ** 2).sum(1)), ((c - b) ** 2).sum(1))
+        return ~(doubled_area > DEGENERATE_RATIO * longest_squared) & np.isfinite(longest_squared)
+
+
+def _merge_equal(vertices: Float64, triangles: Int64) -> tuple[Float64, Int64]:
+    """The vertices in use, each once, sorted by x, y, z; and the triangles over them. (np.unique over rows is ten times slower.)"""
+    used, corner = np.unique(triangles, return_inverse=True)
+    position = vertices[used]
+    order = np.lexsort(position.T[::-1])
+    is_new = np.r_[True, (position[order[1:]] != position[order[:-1]]).any(axis=1)][: len(order)]
+    merged = np.empty(len(order), np.int64)
+    merged[order] = np.cumsum(is_new) - 1
+    return position[order[is_new]], merged[corner.reshape(-1, 3)]
+
+
+def _first_of_equal(triangles: Int64) -> Bool:
+    """(m,) whether each triangle is the first with its corners, whatever their order."""
+    corners = np.sort(triangles, axis=1)
+    order = np.lexsort(corners.T)  # stable: equal ones stay in their order
+    first = np.zeros(len(triangles), bool)
+    first[order] = np.r_[True, (corners[order[1:]] != corners[order[:-1]]).any(axis=1)][: len(order)]
+    return first
+
+
+def _inside_out(vertices: Float64, triangles: Int64, rooms: tuple[Room, ...]) -> Bool:
+    """(m,) whether each triangle belongs to a closed, consistently wound solid of negative volume that is meant to be solid.
+
+    Negative on purpose, and left alone: a cavity (it lies inside another closed surface) and an enclosure such as a room seen from
+    within (other geometry or an authored room lies inside it, or nothing lies outside it).
+    """
+    component, closed = _closed_components(triangles)
+    count = len(closed)
+    middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2  # far from the origin, volumes of absolute positions would cancel
+    a, b, c = (vertices[triangles[:, i]] - middle for i in range(3))
+    volume = np.bincount(component, np.einsum("ij,ij->i", a, np.cross(b, c)), minlength=count)
+    candidates = np.flatnonzero(closed & (volume < 0))
+    if not len(candidates):
+        return np.zeros(len(triangles), bool)
+    low, high = _component_bounds(vertices, triangles, component, count)
+    room_middle = np.array([(np.array(room.minimum) + np.array(room.maximum)) / 2 for room in rooms]).reshape(-1, 3)
+    flip = np.zeros(count, bool)
+    for start in range(0, len(candidates), NESTING_CHUNK):
+        some = candidates[start : start + NESTING_CHUNK]
+        inside_closed = ((low[some, None] > low[closed]) & (high[some, None] < high[closed])).all(axis=2).any(axis=1)
+        contains = ((low[some, None] < low) & (high[some, None] > high)).all(axis=2).any(axis=1)
+        has_room = ((low[some, None] < room_middle) & (high[some, None] > room_middle)).all(axis=2).any(axis=1)
+        around_all = (low[some] <= low.min(axis=0)).all(axis=1) & (high[some] >= high.max(axis=0)).all(axis=1)
+        flip[some] = ~(inside_closed | contains | has_room | around_all)
+    return np.asarray(flip[component], np.bool_)
+
+
+def _component_bounds(vertices: Float64, triangles: Int64, component: Int64, count: int) -> tuple[Float64, Float64]:
+    low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
+    for i in range(3):
+        np.minimum.at(low, component, vertices[triangles[:, i]])
+        np.maximum.at(high, component, vertices[triangles[:, i]])
+    return low, high
+
+
+def _closed_components(triangles: Int64) -> tuple[Int64, Bool]:
+    """(m,) component of each triangle and (n,) whether it is closed.
+
+    Triangles connect where exactly two share an edge, in opposite senses; so solids that only touch stay apart.
+    """
+    m = len(triangles)
+    start, end = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
+    edge = np.minimum(start, end) * (int(triangles.max()) + 1) + np.maximum(start, end)
+    order = np.argsort(edge, kind="stable")
+    ordered = edge[order]
+    begins = np.flatnonzero(np.r_[True, ordered[1:] != ordered[:-1]])
+    pair = begins[np.diff(np.r_[begins, len(ordered)]) == 2]
+    one, other = order[pair], order[pair + 1]
+    opposite = start[one] != start[other]
+    one, other = one[opposite], other[opposite]
+    graph = coo_array((np.ones(len(one), np.int8), (one // 3, other // 3)), shape=(m, m))
+    count, component = connected_components(graph, directed=False)
+    matched = np.zeros(3 * m, bool)
+    matched[one] = matched[other] = True
+    open_triangle = ~matched.reshape(m, 3).all(axis=1)
+    closed = np.bincount(component[open_triangle], minlength=count) == 0
+    return component.astype(np.int64), closed

@@ -1,0 +1,153 @@
+"""world.toml: several sources in one world, with its place, rooms, lamps and probe hints. Every key is checked; unknown ones are refused.
+
+name = "my city"                       # all keys are optional but [[source]] and its path
+north_degrees = 29.0                   # compass azimuth of the world's -Z axis; streets run along the axes when it is theirs
+
+[location]                             # origin of the world; places .geojson and .city.json sources
+latitude = 40.7484
+longitude = -73.9857
+elevation_m = 10.0
+timezone = "America/New_York"          # found from the place when it is not given
+date = 2024-06-21                      # the day that a bare HH:MM means
+
+[[source]]
+path = "city.glb"                      # relative to this file
+offset = [0.0, 0.0, 0.0]               # metres, added in the world frame
+albedo = [0.4, 0.4, 0.4]               # replaces the source's own, linear sRGB
+
+[[room]]
+name = "lobby"
+minimum = [0.0, 0.0, 0.0]
+maximum = [8.0, 4.0, 6.0]
+
+[[lamp]]
+name = "corner"
+kind = "point"                         # point, spot or area
+position = [3.0, 6.0, 2.0]
+lumens = 8000.0
+color = [1.0, 0.8, 0.6]
+range_m = 30.0
+
+[[hint]]
+kind = "add"                           # add, or forbid
+minimum = [0.0, 0.0, 0.0]
+maximum = [8.0, 4.0, 6.0]
+spacing_m = 2.0
+"""
+
+import dataclasses
+import tomllib
+import zoneinfo
+from collections.abc import Callable
+from datetime import date, datetime
+from pathlib import Path
+
+import numpy as np
+
+from bake_jobs.geography import MapFrame, timezone_at
+from bake_jobs.scene import Mesh, ProbeHint, SourceContent, join_meshes
+from bake_jobs.table import Table
+from gi_core.errors import SourceError
+from gi_core.world import Lamp, Location, Room
+
+LAMP_KINDS = ("point", "spot", "area")
+HINT_KINDS = ("add", "forbid")
+MAX_ROOMS = 65_535  # a sector stores room numbers as uint16, and 0 is outdoors
+Loader = Callable[[Path, MapFrame | None], SourceContent]
+
+
+def load_world_file(path: Path, load: Loader) -> SourceContent:
+    """Read a world.toml and, with ``load``, the sources it names. Raises SourceError naming the key that is wrong."""
+    try:
+        top = Table(tomllib.loads(path.read_text(encoding="utf-8")), str(path))
+    except (ValueError, RecursionError) as error:
+        raise SourceError(f"{path}: expected TOML ({error})") from error
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be read ({error.strerror})") from error
+    name = top.text("name", path.stem)
+    north = top.number("north_degrees", 0.0, -360.0, 360.0)
+    given = top.table("location")
+    location = _location(given, north) if given else None
+    frame = MapFrame(location.latitude_degrees, location.longitude_degrees, north) if location else None
+    sources = [_source(table, path.parent, frame, north, load) for table in top.tables("source")]
+    rooms = tuple(_room(table) for table in top.tables("room"))
+    lamps = tuple(_lamp(table) for table in top.tables("lamp"))
+    hints = tuple(_hint(table) for table in top.tables("hint"))
+    top.refuse_unknown()
+    if not sources:
+        raise SourceError(f"{path}: expected at least one [[source]] with a path, found none")
+    if len(rooms) > MAX_ROOMS:
+        raise SourceError(f"{path}: expected at most {MAX_ROOMS} rooms, found {len(rooms)}")
+    placed = [content for content in sources if content.location]
+    if location is None:
+        if len(placed) > 1:
+            raise SourceError(f"{path}: expected a [location] to place {len(placed)} georeferenced sources in one world, found none")
+        location = placed[0].location if placed else dataclasses.replace(Location(), north_degrees=north)
+    return SourceContent(join_meshes([content.mesh for content in sources]), location, rooms, lamps, hints, name)
+
+
+def _location(table: Table, north: float) -> Location:
+    default = Location()
+    latitude = table.number("latitude", None, -90.0, 90.0)
+    longitude = table.number("longitude", None, -180.0, 180.0)
+    timezone = table.text("timezone", "") or timezone_at(latitude, longitude)
+    if timezone not in zoneinfo.available_timezones():
+        raise SourceError(f"{table.where}: timezone: expected an IANA name such as Europe/Berlin, found {timezone!r}")
+    elevation = table.number("elevation_m", 0.0, -500.0, 9000.0)
+    day = table.take("date", default.date)
+    if not isinstance(day, date) or isinstance(day, datetime):
+        raise SourceError(f"{table.where}: date: expected a TOML date such as 2024-06-21 (no quotes), found {day!r}")
+    table.refuse_unknown()
+    return Location(latitude, longitude, elevation, timezone, north, day, "given")
+
+
+def _source(table: Table, folder: Path, frame: MapFrame | None, north: float, load: Loader) -> SourceContent:
+    path = folder / table.text("path", None)
+    offset = table.vector("offset", (0.0, 0.0, 0.0))
+    albedo = table.vector("albedo", (-1.0, -1.0, -1.0), 0.0, 1.0)
+    table.refuse_unknown()
+    if path.suffix.lower() == ".toml":
+        raise SourceError(f"{table.where}: path: expected a mesh or a map, found another world file ({path})")
+    content = load(path, frame)
+    if frame is None and north and content.location:
+        # The file places itself; read it again about the same origin, turned.
+        place = content.location
+        content = load(path, MapFrame(place.latitude_degrees, place.longitude_degrees, north))
+    mesh = content.mesh
+    colour = mesh.albedo if albedo[0] < 0 else np.broadcast_to(np.array(albedo, np.float32), mesh.albedo.shape)
+    return dataclasses.replace(content, mesh=Mesh(mesh.vertices + np.array(offset), mesh.triangles, colour, mesh.emission))
+
+
+def _room(table: Table) -> Room:
+    name = table.text("name", None)
+    minimum, maximum = _box(table)
+    table.refuse_unknown()
+    return Room(name, minimum, maximum)
+
+
+def _lamp(table: Table) -> Lamp:
+    lamp = Lamp(
+        table.text("name", None),
+        table.choice("kind", LAMP_KINDS, "point"),
+        table.vector("position", None),
+        table.number("lumens", None, 0.0, 1e12),
+        table.vector("color", Lamp.color, 0.0, 1e6),
+        table.number("range_m", Lamp.range_m, 0.01, 1e5),
+    )
+    table.refuse_unknown()
+    return lamp
+
+
+def _hint(table: Table) -> ProbeHint:
+    kind = table.choice("kind", HINT_KINDS, None)
+    minimum, maximum = _box(table)
+    spacing = table.number("spacing_m", ProbeHint.spacing_m, 0.25, 1000.0)
+    table.refuse_unknown()
+    return ProbeHint(kind, minimum, maximum, spacing)
+
+
+def _box(table: Table) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    minimum, maximum = table.vector("minimum", None), table.vector("maximum", None)
+    if not all(low < high for low, high in zip(minimum, maximum, strict=True)):
+        raise SourceError(f"{table.where}: expected minimum below maximum on every axis, found {list(minimum)} and {list(maximum)}")
+    return minimum, maximum
