@@ -1,0 +1,207 @@
+"""How wrong is what a dataset serves? Measured against the path tracer, on the dataset's own triangles, under the same lighting.
+
+    stage    served                                                reference
+    probes   lit probe cubes                                       six-face irradiance at the probe
+    near     volume voxels within 3.2 m of a surface               six-face irradiance at the voxel's centre
+    mid      volume voxels 6 m or more from any surface            the same
+    shaded   the volume, sampled as a client samples it            irradiance on the surface point itself
+    floor    exact cubes in place of the volume's, sampled alike   the same
+
+``floor`` is what basis and voxel size cost when transport and interpolation are perfect: exact cubes at all open-air voxels, each
+other voxel filled from the nearest of them, as the server fills its solid ones.
+
+Of the dataset only the served light is believed. Points come from ``compare_points``; surroundings that a partial bake leaves out
+must be handed in as ``scene``, or the reference is lit through the gap.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bake_jobs.compare_points import CLIENT_OFFSET_M, SectorPoints, choose_points, corner_voxels, nearest_open_voxel
+from bake_jobs.compare_report import StageSamples, summarise
+from bake_jobs.compare_states import DEFAULT_STATES, parse_states
+from bake_jobs.path_tracer import Estimate, PathTracer
+from bake_jobs.scene import Scene
+from gi_core.arrays import Float32
+from gi_core.constants import SECTOR_SIZE_M, VOLUME_SHAPE, VOXEL_NO_SECTOR, VOXEL_OUTDOORS
+from gi_core.dataset import Dataset
+from gi_core.engine import Engine
+from gi_core.errors import InputError
+from gi_core.grid import SectorIndex, voxel_centre
+from gi_core.lighting import Lighting
+from gi_core.volume import Volume, sample_volume
+
+# Beyond this, a building hides less of the sky than the reference's noise.
+GEOMETRY_REACH_M = 1024.0
+DEFAULT_SECTORS = 9
+STAGES = ("probes", "near", "mid", "shaded", "floor")
+Progress = Callable[[int, int, str], None]
+
+
+@dataclass(frozen=True)
+class Effort:
+    """points : of each kind in a sector; samples : paths per reference value; seed : of points and paths."""
+
+    points: int = 100
+    samples: int = 1024
+    seed: int = 0
+
+
+def compare_dataset(
+    dataset_path: Path | str,
+    states: Sequence[str] = DEFAULT_STATES,
+    *,
+    sectors: Sequence[SectorIndex] | None = None,
+    points_per_sector: int = 100,
+    samples: int = 1024,
+    seed: int = 0,
+    device: str | None = None,
+    scene: Scene | None = None,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Measure a dataset's error; the same arguments give the same report.
+
+    Parameters
+    ----------
+    states : names of ``compare_states.parse_states``
+    sectors : which to compare; None takes nine, spread over those whose neighbours are in the dataset too
+    points_per_sector : of each kind; samples : paths per reference value; seed : of both
+    device : OpenCL device, as Engine takes it
+    scene : the source's triangles, wanted when the bake left out what surrounds these sectors; otherwise the dataset's are used
+    progress : called with (steps done, steps in all, what was done)
+
+    Returns
+    -------
+    report : ``{preset, basis, states: {state: {stage: {n, median, p95, bias, nrmse, noise}}}, ...}``; see ``compare_report``
+
+    Raises InputError for unknown states or sectors that hold nothing to compare, and what Dataset and Engine raise.
+    """
+    if points_per_sector < 1:
+        raise InputError(f"compare: expected at least 1 point per sector, got {points_per_sector}")
+    dataset = Dataset.open(dataset_path)
+    world = dataset.world
+    if world.basis != "cube":
+        raise InputError(f"{dataset_path}: basis {world.basis!r}; compare knows 'cube'")
+    moments = parse_states(states, world.location)
+    chosen = list(sectors) if sectors is not None else choose_sectors(dataset, seed)
+    effort = Effort(points_per_sector, samples, seed)
+    engine = Engine(dataset, device)
+    lightings = {state.name: engine.lighting(state.time, state.weather) for state in moments}
+    tracer = _tracer(dataset, chosen, scene)
+    found = {state: {stage: StageSamples() for stage in STAGES} for state in lightings}
+    air = {"open": 0, "called_solid": 0}
+
+    for number, index in enumerate(chosen):
+        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index.x & 0xFFFFFFFF, index.z & 0xFFFFFFFF)))
+        points = choose_points(tracer.rays, dataset.geometry(index), dataset.sector(index), effort.points, rng)
+        for place, (state, lighting) in enumerate(lightings.items()):
+            volume = engine.volume(points.eye, lighting)
+            if place == 0:
+                known = points.open_voxel & (volume.mask != VOXEL_NO_SECTOR)
+                air["open"] += int(known.sum())
+                air["called_solid"] += int((known & (volume.mask < VOXEL_OUTDOORS)).sum())
+            stages = found[state]
+            _compare_probes(stages["probes"], engine.lit_sector(index, lighting), points, tracer, lighting, effort)
+            _compare_voxels(stages["near"], volume, points.near, tracer, lighting, effort)
+            _compare_voxels(stages["mid"], volume, points.mid, tracer, lighting, effort)
+            _compare_surfaces(stages["shaded"], stages["floor"], volume, points, tracer, lighting, effort)
+            if progress is not None:
+                progress(number * len(lightings) + place + 1, len(chosen) * len(lightings), f"sector {index.x},{index.z} {state}")
+    if not any(samples.count for stages in found.values() for samples in stages.values()):
+        raise InputError(f"{dataset_path}: nothing to compare in sectors {', '.join(str(i) for i in chosen)}: no open air there")
+    return {
+        "preset": world.preset,
+        "basis": world.basis,
+        "states": {state: {stage: summarise(stages[stage]) for stage in STAGES} for state, stages in found.items()},
+        "moments": {state.name: {"time": lightings[state.name].time, "weather": state.weather} for state in moments},
+        "sectors": [[index.x, index.z] for index in chosen],
+        "dataset": world.bake_id,
+        "points_per_sector": points_per_sector,
+        "samples": samples,
+        "seed": seed,
+        # A client gets filled light where the mask says solid; the judge's voxels there count all the same.
+        "open_air_called_solid": air["called_solid"] / max(air["open"], 1),
+        "floor_fill": "voxels outside open air are filled from the nearest voxel in it, as the server does",
+    }
+
+
+def choose_sectors(dataset: Dataset, seed: int, count: int = DEFAULT_SECTORS) -> list[SectorIndex]:
+    """``count`` sectors with probes, drawn from those whose eight neighbours are in the dataset where there are enough."""
+    known = dataset.world.sectors
+    with_probes = [index for index in sorted(known) if known[index].probes]
+    around = [(dx, dz) for dx in (-1, 0, 1) for dz in (-1, 0, 1)]
+    inner = [i for i in with_probes if all(SectorIndex(i.x + dx, i.z + dz) in known for dx, dz in around)]
+    pool = inner if len(inner) >= min(count, len(with_probes)) else inner or with_probes
+    if not pool:
+        raise InputError(f"{dataset.path}: no sector has a probe, so there is nothing to compare")
+    picks = np.random.default_rng(seed).choice(len(pool), min(count, len(pool)), replace=False)
+    return [pool[i] for i in sorted(picks)]
+
+
+def _tracer(dataset: Dataset, chosen: Sequence[SectorIndex], scene: Scene | None) -> PathTracer:
+    """Over the scene, or over the dataset's triangles within reach of the chosen sectors."""
+    if scene is not None:
+        return PathTracer(scene.vertices, scene.triangles, scene.albedo, scene.emission)
+    reach = int(np.ceil(GEOMETRY_REACH_M / SECTOR_SIZE_M))
+    centre = np.array(chosen)
+    near = [i for i in sorted(dataset.world.sectors) if (np.abs(centre - np.array(i)).max(axis=1) <= reach).any()]
+    parts = [dataset.geometry(index) for index in near]
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    return PathTracer(
+        np.concatenate([part.vertices for part in parts]),
+        np.concatenate([part.triangles + start for part, start in zip(parts, starts, strict=False)]).astype(np.int32),
+        np.concatenate([part.albedo for part in parts]),
+        np.concatenate([part.emission for part in parts]),
+    )
+
+
+def _cubes(tracer: PathTracer, points: Any, lighting: Lighting, effort: Effort) -> Estimate:
+    return tracer.cube_irradiance(points, lighting, samples=effort.samples, seed=effort.seed)
+
+
+def _compare_probes(
+    samples: StageSamples, lit: Float32, points: SectorPoints, tracer: PathTracer, lighting: Lighting, effort: Effort
+) -> None:
+    samples.add(lit[points.probe], _cubes(tracer, points.probe_position, lighting, effort))
+
+
+def _compare_voxels(samples: StageSamples, volume: Volume, voxels: Any, tracer: PathTracer, lighting: Lighting, effort: Effort) -> None:
+    y, z, x = voxels.T
+    centre = voxel_centre(voxels[:, [2, 0, 1]] + volume.first_voxel)
+    known = volume.mask[y, z, x] != VOXEL_NO_SECTOR
+    served = volume.values[:, y, z, x].transpose(1, 0, 2)
+    samples.add(served[known], _cubes(tracer, centre[known], lighting, effort))
+
+
+def _compare_surfaces(
+    shaded: StageSamples,
+    floor: StageSamples,
+    volume: Volume,
+    points: SectorPoints,
+    tracer: PathTracer,
+    lighting: Lighting,
+    effort: Effort,
+) -> None:
+    """Both stages on surfaces share their reference."""
+    sampled_at = points.surface + CLIENT_OFFSET_M * points.normal
+    reference = tracer.surface_irradiance(points.surface, points.normal, lighting, samples=effort.samples, seed=effort.seed)
+    shaded.add(sample_volume(volume.values, volume.origin, volume.voxel_size, sampled_at, points.normal), reference)
+    if not points.open_voxel.any():
+        return
+    corner = corner_voxels(sampled_at, volume.origin).reshape(-1, 3)
+    corner = np.unique(corner, axis=0)
+    source = nearest_open_voxel(points.open_voxel)[:, *corner.T].T
+    needed, which = np.unique(source, axis=0, return_inverse=True)
+    exact = _cubes(tracer, voxel_centre(needed[:, [2, 0, 1]] + volume.first_voxel), lighting, effort)
+    values = np.zeros((6, *VOLUME_SHAPE, 3), np.float32)
+    values[:, *corner.T] = exact.mean[which.reshape(-1)].transpose(1, 0, 2)
+    rebuilt = sample_volume(values, volume.origin, volume.voxel_size, sampled_at, points.normal)
+    noise = np.zeros((6, *VOLUME_SHAPE, 3), np.float32)
+    noise[:, *corner.T] = exact.standard_error[which.reshape(-1)].transpose(1, 0, 2)
+    # Corners' errors are independent, so their weighted sum overstates the noise: an upper bound.
+    rebuilt_noise = sample_volume(noise, volume.origin, volume.voxel_size, sampled_at, points.normal)
+    floor.add(rebuilt, Estimate(reference.mean, np.hypot(reference.standard_error, rebuilt_noise)))

@@ -1,0 +1,173 @@
+"""Where a sector is compared with the path tracer: chosen by casting rays into the mesh, without asking the bake what it thinks.
+
+A point counts as open air when some of the sky is seen from it. Inside a solid none is, however the mesh is wound and whether
+or not it has a bottom; what an overlapping part buries drops out by the same test.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+
+from bake_jobs.rays import SURFACE_OFFSET_M, RayScene
+from gi_core.arrays import Bool, Float64, Int64
+from gi_core.constants import ROOM_OUTDOORS, SECTOR_SIZE_M, VOLUME_SHAPE, VOXEL_SIZE_M
+from gi_core.geometry_file import Geometry
+from gi_core.grid import SectorIndex, volume_first_voxel, voxel_centre
+from gi_core.sector import PROBE_IN_MARGIN, Sector
+
+EYE_HEIGHT_M = 1.7
+# A client reads the volume a quarter voxel off a surface: closer reads through it, farther reads other light.
+CLIENT_OFFSET_M = 0.25 * VOXEL_SIZE_M
+NEAR_M = 3.2  # about one voxel
+MID_M = 6.0
+LOOK_DIRECTIONS = 192
+# Of the 96 upward rays. One may slip through the hair-wide cracks between sectors' cut geometries; two do not.
+SKY_RAYS_MIN = 2
+_POINTS_AT_ONCE = 2048
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """distance : (n,) [m] to the nearest surface met by the look-around rays; sees_sky : (n,) bool, the point is in open air."""
+
+    distance: Float64
+    sees_sky: Bool
+
+
+@dataclass(frozen=True, eq=False)
+class SectorPoints:
+    """Where one sector is compared. World frame, metres.
+
+    eye : (3,) where a player stands; the volume is the one around it
+    probe : (p,) indices of probes in open air; probe_position : (p, 3)
+    near, mid : (k, 3) int64, indices (z, y, x) into the volume: open-air voxels, at most NEAR_M and at least MID_M from a surface
+    surface, normal : (s, 3) points on surfaces and unit normals towards the open air that their light comes from
+    open_voxel : (16, 32, 32) bool, voxels of the volume in open air
+    """
+
+    eye: Float64
+    probe: Int64
+    probe_position: Float64
+    near: Int64
+    mid: Int64
+    surface: Float64
+    normal: Float64
+    open_voxel: Bool
+
+
+def choose_points(rays: RayScene, geometry: Geometry, sector: Sector, count: int, rng: np.random.Generator) -> SectorPoints:
+    """At most ``count`` points of each kind in one sector."""
+    eye = standing_eye(rays, sector.index, geometry)
+    first = volume_first_voxel(eye)
+    index = np.stack(np.indices(VOLUME_SHAPE), axis=-1).reshape(-1, 3)  # (y, z, x)
+    centre = voxel_centre(index[:, [2, 0, 1]] + first)
+    seen = look_around(rays, centre)
+    origin = sector.index.origin
+    in_sector = ((centre >= origin) & (centre < origin + SECTOR_SIZE_M))[:, [0, 2]].all(axis=1)
+    free = seen.sees_sky & in_sector
+    probe_position = sector.probe_position.astype(np.float64) + origin
+    outdoors = (sector.probe_room == ROOM_OUTDOORS) & (sector.probe_flags & PROBE_IN_MARGIN == 0)
+    probe = _some(np.flatnonzero(outdoors & look_around(rays, probe_position).sees_sky), count, rng)
+    surface, normal = _surface_points(rays, geometry, (voxel_centre(first), VOLUME_SHAPE), count, rng)
+    return SectorPoints(
+        eye=eye,
+        probe=probe,
+        probe_position=probe_position[probe],
+        near=index[_some(np.flatnonzero(free & (seen.distance <= NEAR_M)), count, rng)],
+        mid=index[_some(np.flatnonzero(free & (seen.distance >= MID_M)), count, rng)],
+        surface=surface,
+        normal=normal,
+        open_voxel=seen.sees_sky.reshape(VOLUME_SHAPE),
+    )
+
+
+def standing_eye(rays: RayScene, index: SectorIndex, geometry: Geometry) -> Float64:
+    """(3,): above the middle of a sector, at the height of someone who stands on the lowest tenth of what rain would wet."""
+    steps = (np.arange(16) + 0.5) / 16 * SECTOR_SIZE_M
+    x, z = (grid.ravel() for grid in np.meshgrid(steps, steps))
+    top = float(geometry.vertices[:, 1].max()) + 1.0 if len(geometry.vertices) else 0.0
+    above = index.origin + np.stack([x, np.full_like(x, top), z], axis=1)
+    hits = rays.closest(above, np.broadcast_to(np.array([0.0, -1.0, 0.0]), above.shape))
+    ground = top - float(np.quantile(hits.distance[hits.hit], 0.9)) if hits.hit.any() else 0.0
+    return np.asarray(index.origin + np.array([SECTOR_SIZE_M / 2, ground + EYE_HEIGHT_M, SECTOR_SIZE_M / 2]))
+
+
+def look_around(rays: RayScene, points: Float64) -> Surroundings:
+    """What surrounds points (n, 3) [m], by the same LOOK_DIRECTIONS directions from each."""
+    directions = _fibonacci_sphere(LOOK_DIRECTIONS)
+    upward = directions[:, 1] > 0
+    distance, sky_rays = np.empty(len(points)), np.empty(len(points), np.int64)
+    for start in range(0, len(points), _POINTS_AT_ONCE):
+        some = slice(start, start + _POINTS_AT_ONCE)
+        origins = np.repeat(points[some], LOOK_DIRECTIONS, axis=0)
+        hits = rays.closest(origins, np.tile(directions, (len(points[some]), 1)))
+        lengths = hits.distance.reshape(-1, LOOK_DIRECTIONS)
+        distance[some] = lengths.min(axis=1)
+        sky_rays[some] = np.isinf(lengths[:, upward]).sum(axis=1)
+    return Surroundings(distance, sky_rays >= SKY_RAYS_MIN)
+
+
+def nearest_open_voxel(open_voxel: Bool) -> Int64:
+    """For each voxel the index of the nearest open one, itself where it is open: (16, 32, 32) -> (3, 16, 32, 32), (y, z, x)."""
+    return np.asarray(distance_transform_edt(~open_voxel, return_distances=False, return_indices=True), np.int64)
+
+
+def corner_voxels(points: Float64, origin: Float64) -> Int64:
+    """The eight voxels that trilinear sampling at points (n, 3) [m] mixes: (n, 8, 3) int64, (y, z, x), clamped to the volume.
+
+    origin : (3,) [m], centre of voxel (0, 0, 0).
+    """
+    low = np.floor((points - origin) / VOXEL_SIZE_M).astype(np.int64)
+    corner = low[:, None, :] + np.stack(np.indices((2, 2, 2)), axis=-1).reshape(-1, 3)
+    return np.clip(corner[..., [1, 2, 0]], 0, np.array(VOLUME_SHAPE) - 1)
+
+
+def _surface_points(
+    rays: RayScene, geometry: Geometry, volume: tuple[Float64, tuple[int, int, int]], count: int, rng: np.random.Generator
+) -> tuple[Float64, Float64]:
+    """At most ``count`` points spread evenly over the sector's surface within the volume, and normals towards open air."""
+    corners = geometry.vertices[geometry.triangles]
+    a, edges_b, edges_c = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    doubled = np.cross(edges_b, edges_c)
+    length = np.linalg.norm(doubled, axis=1)
+    if not length.sum() > 0 or count == 0:
+        return np.zeros((0, 3)), np.zeros((0, 3))
+    # Most of a tower's surface lies above the volume or faces another's inside: draw many and keep those that count.
+    chosen = rng.choice(len(length), 64 * count, p=length / length.sum())
+    u, v = rng.random((2, len(chosen), 1))
+    folded = u + v > 1
+    u, v = np.where(folded, 1 - u, u), np.where(folded, 1 - v, v)
+    point = a[chosen] + u * edges_b[chosen] + v * edges_c[chosen]
+    normal = doubled[chosen] / length[chosen, None]
+    normal[rng.random(len(normal)) < 0.5] *= -1
+
+    low, high = volume[0], volume[0] + VOXEL_SIZE_M * (np.array(volume[1])[[2, 0, 1]] - 1)
+    inside = ((point - CLIENT_OFFSET_M >= low) & (point + CLIENT_OFFSET_M <= high)).all(axis=1)
+    some = np.flatnonzero(inside)[: 16 * count]
+    point, normal = point[some], normal[some]
+    in_front, behind = _open_air_off(rays, point, normal), _open_air_off(rays, point, -normal)
+    normal = np.where(in_front[:, None], normal, -normal)
+    found = np.flatnonzero(in_front | behind)[:count]
+    return point[found], normal[found]
+
+
+def _open_air_off(rays: RayScene, point: Float64, normal: Float64) -> Bool:
+    """Whether the air in front of surfaces sees the sky: looked at where a client samples, or halfway to what stands closer."""
+    start = point + 2 * SURFACE_OFFSET_M * normal
+    free = rays.closest(start, normal).distance.astype(np.float64)
+    off = np.minimum(CLIENT_OFFSET_M, free / 2)
+    return look_around(rays, start + off[:, None] * normal).sees_sky
+
+
+def _some(indices: Int64, count: int, rng: np.random.Generator) -> Int64:
+    """At most ``count`` of the indices, ascending."""
+    return np.sort(rng.choice(indices, count, replace=False)) if len(indices) > count else indices
+
+
+def _fibonacci_sphere(count: int) -> Float64:
+    """(count, 3) unit vectors, evenly spread; half of them look up."""
+    y = 1 - (2 * np.arange(count) + 1) / count
+    turn = np.arange(count) * np.pi * (3 - np.sqrt(5))
+    level = np.sqrt(1 - y * y)
+    return np.stack([level * np.cos(turn), y, level * np.sin(turn)], axis=1)

@@ -1,0 +1,145 @@
+"""What ``compare`` says: error statistics, a table, JSON and a chart.
+
+Errors are of luminance, relative: |served - reference| / max(reference, 2 % of the mean reference), over all six faces for probes and
+voxels.
+
+    n       values compared (a cube counts six)
+    median, p95   of the relative error
+    bias    sum(served - reference) / sum(reference)
+    nrmse   root mean square of (served - reference), over the mean reference
+    noise   median relative standard error of the reference itself; an error near it is not resolved
+"""
+
+import json
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image, ImageDraw
+from rich.table import Table
+
+from bake_jobs.path_tracer import Estimate
+from gi_core.arrays import AnyArray, Float64
+from gi_core.container import write_atomic
+from gi_core.spectrum import LUMINANCE_FROM_RGB
+
+# Below this share of the mean a point is black to the eye, and dividing by it would only measure noise.
+DARKEST_SHARE_OF_MEAN = 0.02
+
+BAR_COLOURS = ("#4878a8", "#d08a3c", "#5f9e5a", "#9a6fb0", "#b85a5a", "#6f8f98")
+CHART_SIZE = (900, 420)
+CHART_MARGIN = (60, 40, 20, 60)  # left, top, right, bottom
+CHART_DECADES = (0.001, 10.0)
+
+
+@dataclass
+class StageSamples:
+    """Luminances [lx] of one state and stage, gathered over sectors."""
+
+    served: list[Float64] = field(default_factory=list)
+    reference: list[Float64] = field(default_factory=list)
+    standard_error: list[Float64] = field(default_factory=list)
+
+    def add(self, served: AnyArray, reference: Estimate) -> None:
+        """Served values (..., 3) [lx] beside their reference."""
+        self.served.append(_luminance(served))
+        self.reference.append(_luminance(reference.mean))
+        # One path carries all channels, so their errors move together and add.
+        self.standard_error.append(_luminance(reference.standard_error))
+
+    @property
+    def count(self) -> int:
+        return sum(len(values) for values in self.reference)
+
+
+def summarise(samples: StageSamples) -> dict[str, Any]:
+    """``{n, median, p95, bias, nrmse, noise}`` of one stage; all but n are None where there is nothing, or no light, to compare."""
+    if samples.count == 0:
+        return {"n": 0, "median": None, "p95": None, "bias": None, "nrmse": None, "noise": None}
+    served, reference, error = (np.concatenate(v) for v in (samples.served, samples.reference, samples.standard_error))
+    mean = float(reference.mean())
+    if not mean > 0:
+        return {"n": len(served), "median": None, "p95": None, "bias": None, "nrmse": None, "noise": None}
+    scale = np.maximum(reference, DARKEST_SHARE_OF_MEAN * mean)
+    relative = np.abs(served - reference) / scale
+    return {
+        "n": len(served),
+        "median": float(np.median(relative)),
+        "p95": float(np.quantile(relative, 0.95)),
+        "bias": float((served - reference).sum() / reference.sum()),
+        "nrmse": float(np.sqrt(np.mean((served - reference) ** 2)) / mean),
+        "noise": float(np.median(error / scale)),
+    }
+
+
+def report_table(report: dict[str, Any]) -> Table:
+    """The report for a terminal, in percent."""
+    table = Table(title=f"{report['preset']}, {report['basis']}: error against the path tracer")
+    table.add_column("state")
+    table.add_column("stage")
+    for name in ("n", "median", "p95", "bias", "nrmse", "noise"):
+        table.add_column(name, justify="right")
+    for state, stages in report["states"].items():
+        for row, (stage, numbers) in enumerate(stages.items()):
+            percents = [_percent(numbers[name], signed=name == "bias") for name in ("median", "p95", "bias", "nrmse", "noise")]
+            table.add_row(state if row == 0 else "", stage, f"{numbers['n']:,}", *percents, end_section=row == len(stages) - 1)
+    table.caption = (
+        f"{len(report['sectors'])} sectors, seed {report['seed']}, {report['samples']} paths per reference value. "
+        f"{report['open_air_called_solid']:.1%} of open-air voxels are called solid. floor: {report['floor_fill']}"
+    )
+    return table
+
+
+def write_json(path: Path, report: dict[str, Any]) -> None:
+    """Write the report; the file is whole or not there."""
+    write_atomic(path, (json.dumps(report, indent=1, allow_nan=False) + "\n").encode())
+
+
+def draw_chart(report: dict[str, Any]) -> Image.Image:
+    """A bar to the median and a whisker to the 95th percentile for each stage and state, on a logarithmic scale."""
+    image = Image.new("RGB", CHART_SIZE, "white")
+    draw = ImageDraw.Draw(image)
+    left, top, right, bottom = CHART_MARGIN
+    width, height = CHART_SIZE[0] - left - right, CHART_SIZE[1] - top - bottom
+    low, high = (math.log10(v) for v in CHART_DECADES)
+
+    def row_of(value: float) -> float:
+        share = (math.log10(min(max(value, CHART_DECADES[0]), CHART_DECADES[1])) - low) / (high - low)
+        return top + height * (1 - share)
+
+    for decade in range(round(low), round(high) + 1):
+        y = row_of(10.0**decade)
+        draw.line([(left, y), (left + width, y)], fill="#dddddd")
+        draw.text((left - 8, y), f"{100 * 10.0**decade:g} %", fill="black", anchor="rm")
+    states = report["states"]
+    stages = list(next(iter(states.values())))
+    group = width / len(stages)
+    bar = 0.8 * group / len(states)
+    for place, stage in enumerate(stages):
+        draw.text((left + group * (place + 0.5), top + height + 10), stage, fill="black", anchor="mt")
+        for number, numbers in enumerate(states.values()):
+            if numbers[stage]["median"] is None:
+                continue
+            x = left + group * (place + 0.1) + bar * number
+            colour = BAR_COLOURS[number % len(BAR_COLOURS)]
+            draw.rectangle([x, row_of(numbers[stage]["median"]), x + 0.85 * bar, top + height], fill=colour)
+            middle = x + 0.425 * bar
+            draw.line([(middle, row_of(numbers[stage]["median"])), (middle, row_of(numbers[stage]["p95"]))], fill=colour, width=2)
+    title = f"{report['preset']}, {report['basis']}: relative error of luminance, median (bar) and p95 (whisker)"
+    draw.text((left, 12), title, fill="black")
+    for number, state in enumerate(states):
+        x = left + 130 * number
+        draw.rectangle([x, CHART_SIZE[1] - 24, x + 12, CHART_SIZE[1] - 12], fill=BAR_COLOURS[number % len(BAR_COLOURS)])
+        draw.text((x + 18, CHART_SIZE[1] - 18), state, fill="black", anchor="lm")
+    return image
+
+
+def _luminance(values: AnyArray) -> Float64:
+    """(..., 3) -> flat (n,) float64."""
+    return np.asarray(np.asarray(values, np.float64) @ LUMINANCE_FROM_RGB).reshape(-1)
+
+
+def _percent(value: float | None, signed: bool = False) -> str:
+    return "-" if value is None else f"{100 * value:+.1f} %" if signed else f"{100 * value:.1f} %"
