@@ -8,9 +8,10 @@ from functools import cache
 
 import numpy as np
 
+from gi_core.air import EARTH_RADIUS_KM
 from gi_core.ambient_cube import project_radiance
 from gi_core.arrays import Float64
-from gi_core.atmosphere import AEROSOL_ASYMMETRY, EARTH_RADIUS_KM, Atmosphere, SkyScattering
+from gi_core.atmosphere import AEROSOL_ASYMMETRY, Atmosphere, SkyScattering
 from gi_core.constants import SKY_SHAPE
 from gi_core.spectrum import RGB_FROM_SPECTRUM
 
@@ -22,6 +23,10 @@ NIGHT_ZENITH_CD_M2 = 1.9e-4
 AIRGLOW_HEIGHT_KM = 90.0
 # Slightly warmer than the day: green and red oxygen lines on starlight. Linear sRGB of luminance 1.
 NIGHT_COLOUR = np.array([1.08, 0.995, 0.81])
+
+# Light that leaves a cloud base has crossed more air, up and down between ground and cloud, than the light above: overcast daylight
+# measures 6000-6500 K where sun and clear sky together measure 5500 K (Judd, MacAdam and Wyszecki 1964). Luminance 1.
+CLOUD_COLOUR = np.array([0.92, 1.0134, 1.1])
 
 # A ground fog is about this deep; the vertical path through it.
 FOG_LAYER_M = 100.0
@@ -78,7 +83,7 @@ def clear_sky(air: Atmosphere, direction: Float64, spectrum: Float64, ground_alb
 
 def _around(parts: SkyScattering, rgb_from_share: Float64, direction: Float64) -> list[Float64]:
     """The parts in RGB, turned to where the light stands: (32, 128, 3) each."""
-    azimuths = parts.rayleigh.shape[1]
+    azimuths = parts.air.shape[1]
     towards = np.arctan2(direction[2], direction[0])
     columns = 2 * np.pi * (np.arange(COLUMNS) + 0.5) / COLUMNS
     relative = np.abs((columns - towards + np.pi) % (2 * np.pi) - np.pi)
@@ -86,7 +91,7 @@ def _around(parts: SkyScattering, rgb_from_share: Float64, direction: Float64) -
     first = np.minimum(at.astype(np.intp), azimuths - 2)
     share = (at - first)[:, None]
     maps = []
-    for part in (parts.rayleigh, parts.aerosol, parts.multiple):
+    for part in (parts.air, parts.aerosol, parts.multiple):
         rgb = part @ rgb_from_share.T
         maps.append(rgb[:, first] * (1 - share) + rgb[:, first + 1] * share)
     return maps
@@ -110,7 +115,7 @@ def with_clouds(clear: Float64, beam_on_ground: Float64, cover: float, transmiss
     """
     gradation = (1 + 2 * map_directions()[..., 1:2]) / 3 * np.ones(3)  # Moon and Spencer 1942; CIE S 011
     above = horizontal_illuminance(clear) + beam_on_ground
-    clouds = gradation * (above * transmission / horizontal_illuminance(gradation))
+    clouds = gradation * (CLOUD_COLOUR * above * transmission / horizontal_illuminance(gradation))
     return (1 - cover) * clear + cover * clouds
 
 

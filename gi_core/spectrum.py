@@ -14,7 +14,7 @@ WAVELENGTH_NM = np.array([400.0, 440.0, 480.0, 520.0, 560.0, 600.0, 640.0, 680.0
 
 # Illuminance of the sun above the air at 1 au. Darula, Kittler and Gueymard, "Reference luminous solar constant", 2005.
 SOLAR_ILLUMINANCE_LX = 133.3e3
-SOLAR_TEMPERATURE_K = 5778.0
+SOLAR_TEMPERATURE_K = 5900.0  # correlated colour temperature of sunlight above the air
 
 LUMINANCE_FROM_RGB = np.array([0.2126, 0.7152, 0.0722])
 
