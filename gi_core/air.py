@@ -8,7 +8,7 @@ from functools import cache
 
 import numpy as np
 
-from gi_core.arrays import Float64
+from gi_core.arrays import Float32, Float64
 
 EARTH_RADIUS_KM = 6360.0
 TOP_KM = 100.0
@@ -95,7 +95,7 @@ class ColumnsAt:
         return np.asarray(np.degrees(np.arcsin(np.clip(sine, -1, 1)) - np.arcsin(self._horizon)[..., None]), np.float64)
 
 
-def rows_at(rows: Float64, column: Float64) -> Float64:
+def rows_at(rows: Float32 | Float64, column: Float64) -> Float64:
     """Linear samples of rows (..., columns, k) at fractional columns (..., a), clamped -> (..., a, k)."""
     columns, k = rows.shape[-2:]
     column = np.clip(column, 0, columns - 1)
@@ -104,8 +104,4 @@ def rows_at(rows: Float64, column: Float64) -> Float64:
     row_starts = np.arange(rows.size // (columns * k)).reshape(*rows.shape[:-2], 1) * columns
     flat, at = rows.reshape(-1, k), row_starts + first
     low = flat.take(at, axis=0)
-    high = flat.take(at + 1, axis=0)
-    high -= low
-    high *= share
-    high += low
-    return high
+    return np.asarray(low + share * (flat.take(at + 1, axis=0) - low), np.float64)

@@ -60,8 +60,11 @@ def _make_lighting(location: Location, moment: datetime, weather: Weather) -> Li
         if position.elevation_degrees > DARK_BELOW_DEGREES and not lost_in_daylight:
             sky += clear_sky(air, direction, spectrum, ground_albedo)
     sines = np.array([max(float(direction[1]), 0.0) for direction in directions])
-    sky = with_clouds(sky, sines @ beams, weather.cloud_cover, weather.cloud_transmission)
-    sky, beams = with_fog(sky, beams * (1 - weather.cloud_cover), sines, weather.fog_density)
+    if weather.cloud_cover > 0:
+        sky = with_clouds(sky, sines @ beams, weather.cloud_cover, weather.cloud_transmission)
+        beams *= 1 - weather.cloud_cover
+    if weather.fog_density > 0:
+        sky, beams = with_fog(sky, beams, sines, weather.fog_density)
 
     radiance = np.zeros((*SKY_SHAPE, 3), np.float32)
     radiance[:ROWS] = sky

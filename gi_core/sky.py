@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 
 from gi_core.air import EARTH_RADIUS_KM
-from gi_core.ambient_cube import project_radiance
+from gi_core.ambient_cube import FACE_DIRECTIONS
 from gi_core.arrays import Float64
 from gi_core.atmosphere import AEROSOL_ASYMMETRY, Atmosphere, SkyScattering
 from gi_core.constants import SKY_SHAPE
@@ -57,10 +57,16 @@ def horizontal_illuminance(sky: Float64) -> Float64:
     return np.asarray(weight @ sky.sum(axis=1), np.float64)
 
 
+@cache
+def _cube_weights() -> Float64:
+    """(6, 32 * 128) [sr]: what each texel's radiance gives to each face."""
+    cosine = np.maximum(FACE_DIRECTIONS.astype(np.float64) @ map_directions().reshape(-1, 3).T, 0.0)
+    return cosine * np.repeat(row_solid_angle(), COLUMNS)
+
+
 def cube_of_sky(sky: Float64) -> Float64:
     """(6, 3) [lx]: a map's irradiance along the axes, +X -X +Y -Y +Z -Z; none from below."""
-    solid_angle = np.repeat(row_solid_angle(), COLUMNS)
-    return project_radiance(map_directions().reshape(-1, 3), sky.reshape(-1, 3), solid_angle)
+    return np.asarray(_cube_weights() @ sky.reshape(-1, 3), np.float64)
 
 
 def clear_sky(air: Atmosphere, direction: Float64, spectrum: Float64, ground_albedo: float) -> Float64:
