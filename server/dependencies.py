@@ -35,9 +35,8 @@ class StrictQuery(BaseModel):
         unknown = sorted(set(values) - set(cls.model_fields)) if isinstance(values, dict) else []
         if unknown:
             shown = ", ".join(name[:40] for name in unknown[:5])
-            known = ", ".join(cls.model_fields) or "none"
-            message = "unknown query parameter {shown}; expected {known}"
-            raise PydanticCustomError("unknown_parameter", message, {"shown": shown, "known": known})
+            known = f"one of {', '.join(cls.model_fields)}" if cls.model_fields else "no parameter"
+            raise PydanticCustomError("unknown_parameter", "{shown}: expected {known}", {"known": known, "shown": shown})
         return values
 
 
@@ -91,7 +90,7 @@ def parse_vector(text: str) -> Float64:
     except ValueError:
         values = []
     if len(values) != 3 or not all(math.isfinite(v) and abs(v) <= MAX_COORDINATE_M for v in values):
-        raise ValueError(f"expected three numbers x,y,z within {MAX_COORDINATE_M:g} m, found {text[:60]!r}")
+        raise ValueError(f"three numbers x,y,z within {MAX_COORDINATE_M:g} m")
     return np.array(values, np.float64)
 
 
@@ -108,7 +107,7 @@ class PreviewQuery(LightingQuery):
     @model_validator(mode="after")
     def _has_direction(self) -> "PreviewQuery":
         if np.linalg.norm(parse_vector(self.look) - parse_vector(self.eye)) < 1e-3:
-            raise ValueError("look: expected a point at least 1 mm from eye, found the same point")
+            raise ValueError("look to be at least 1 mm from eye")
         return self
 
 

@@ -12,18 +12,17 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from gi_core.volume import Volume, sample_volume
 
 from gi_core.arrays import Float32, Float64, Int64
 from gi_core.constants import VOLUME_SHAPE, VOXEL_SIZE_M
 from gi_core.lighting import Lighting
+from gi_core.volume import Volume, sample_volume
 from server.preview_scene import PreviewScene
 
 Indirect = Literal["on", "off", "split"]
 VolumeAt = Callable[[Float64], Volume]
 
 ASPECT = 9 / 16
-# design.md 3.6: right at a wall trilinear sampling mixes in the voxels inside it.
 SAMPLE_OFFSET_M = VOXEL_SIZE_M / 4
 # Neighbouring volumes overlap by 4 voxels along each axis, so that every sample lies between voxel centres even after snapping.
 TILE_M = (np.array([VOLUME_SHAPE[2], VOLUME_SHAPE[0], VOLUME_SHAPE[1]]) - 4) * VOXEL_SIZE_M
@@ -89,13 +88,13 @@ def indirect_pixels(pixel: Int64, width: int, indirect: Indirect) -> Int64:
 
 def indirect_irradiance(position: Float64, normal: Float32, volume_at: VolumeAt) -> Float64:
     """Irradiance (n, 3) [lx] at surface points (n, 3) [m] with normals (n, 3), read from as many volumes as they need."""
-    points = position + SAMPLE_OFFSET_M * normal
-    result = np.zeros((len(points), 3))
-    centres, which = plan_volumes(points)
+    result = np.zeros((len(position), 3))
+    # sample_volume reads this far off the surface, which may be the next volume's.
+    centres, which = plan_volumes(position + SAMPLE_OFFSET_M * normal)
     for i, centre in enumerate(centres):
         members = np.flatnonzero(which == i)
         volume = volume_at(centre)
-        result[members] = sample_volume(volume.values, volume.origin, volume.voxel_size, points[members], normal[members])
+        result[members] = sample_volume(volume.values, volume.origin, volume.voxel_size, position[members], normal[members])
     return result
 
 

@@ -29,6 +29,8 @@ STATUS_OF: tuple[tuple[type[Exception], HTTPStatus], ...] = (
     (SectorlightError, HTTPStatus.INTERNAL_SERVER_ERROR),
 )
 
+LONGEST_ECHO = 80  # of what a client sent, in a reply or a log
+
 CODE_OF_STATUS = {400: "bad_request", 404: "no_such_path", 405: "method_not_allowed", 416: "range_not_satisfiable"}
 
 
@@ -74,20 +76,34 @@ def _range_error(_: Request, error: Exception) -> JSONResponse:
 
 def _bad_parameters(_: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, RequestValidationError)
-    errors = [
-        {"parameter": ".".join(str(part) for part in item["loc"][1:]) or None, "expected": item["msg"], "code": item["type"]}
-        for item in error.errors()
-    ]
-    detail = "; ".join(f"{e['parameter']}: {e['expected']}" if e["parameter"] else str(e["expected"]) for e in errors)
+    errors = [_bad_parameter(item) for item in error.errors()]
+    detail = "; ".join(
+        ": ".join(part for part in (e["parameter"], f"expected {e['expected']}, found {e['found']}") if part) for e in errors
+    )
     return problem(400, "bad_parameter", detail, errors=errors)
+
+
+def _bad_parameter(item: Mapping[str, Any]) -> dict[str, str]:
+    """One of pydantic's complaints in our words: which parameter, what was expected, what was found."""
+    if item["type"] == "unknown_parameter":
+        context = item["ctx"]
+        return {"parameter": context["shown"], "expected": context["known"], "found": "an unknown parameter", "code": item["type"]}
+    expected = str(item["msg"]).removeprefix("Value error, ").removeprefix("Input should be ").removeprefix("expected ")
+    found = item.get("input")
+    return {
+        "parameter": ".".join(str(part) for part in item["loc"][1:]),
+        "expected": "a value" if item["type"] == "missing" else expected,
+        "found": repr(found)[:LONGEST_ECHO] if isinstance(found, str | int | float) else "none",
+        "code": str(item["type"]),
+    }
 
 
 def _http_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, HTTPException)
     status = error.status_code
     detail = {
-        404: f"{request.url.path}: no such path; expected one that /docs lists",
-        405: f"{request.method} {request.url.path}: expected {(error.headers or {}).get('Allow', 'another method')}",
+        404: f"{request.url.path[:LONGEST_ECHO]}: no such path; expected one that /docs lists",
+        405: f"{request.method} {request.url.path[:LONGEST_ECHO]}: expected {(error.headers or {}).get('Allow', 'another method')}",
     }.get(status, str(error.detail))
     return problem(status, CODE_OF_STATUS.get(status, "http_error"), detail, error.headers)
 

@@ -2,13 +2,12 @@
 
 import logging
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from gi_core.dataset import Dataset
 from gi_core.engine import Engine
-
 from gi_core.grid import SectorIndex
 from gi_core.lighting import Lighting
 from server.preview_scene import PreviewScenes
@@ -20,8 +19,8 @@ log = logging.getLogger("sectorlight.service")
 class Service:
     """Shared by all requests of a process.
 
-    Routes run on a pool of threads. The engine has one command queue, so one query relights at a time (``engine_turn``); pictures are the
-    only other heavy work and also take turns. Waiting threads hold no arrays, so memory does not grow with the queue.
+    Routes run on a pool of threads. The engine lights for one of them at a time, and pictures, the only other heavy work, take turns.
+    Waiting threads hold no arrays, so memory does not grow with the queue.
     """
 
     def __init__(self, dataset: Dataset, engine: Engine, settings: Settings) -> None:
@@ -29,20 +28,16 @@ class Service:
         self.engine = engine
         self.settings = settings
         self.preview_scenes = PreviewScenes(dataset)
-        self._engine_lock = threading.Lock()
         self._preview_lock = threading.Lock()
+        self._misfits = misfits(dataset, dataset.world.sectors)
+        for reason in self._misfits.values():
+            log.error("%s", reason)
 
     @classmethod
     def open(cls, dataset_path: Path, settings: Settings) -> "Service":
         """Open a dataset and a device; InputError, FormatError or KernelBuildError when either cannot be used."""
         dataset = Dataset.open(dataset_path)
         return cls(dataset, Engine(dataset, settings.device), settings)
-
-    @contextmanager
-    def engine_turn(self) -> Iterator[Engine]:
-        """The engine, for this thread alone."""
-        with self._engine_lock:
-            yield self.engine
 
     @contextmanager
     def preview_turn(self) -> Iterator[None]:
@@ -56,5 +51,21 @@ class Service:
 
     @property
     def failed_sectors(self) -> dict[SectorIndex, str]:
-        """Sectors whose files were refused, and why."""
-        return dict(self.engine.failed_sectors)
+        """Sectors that queries are refused for, and why: files of the wrong size, and files that did not survive being read."""
+        self._misfits = misfits(self.dataset, self._misfits)
+        return self._misfits | self.engine.failed_sectors
+
+
+def misfits(dataset: Dataset, sectors: Iterable[SectorIndex]) -> dict[SectorIndex, str]:
+    """Which of ``sectors`` have a file that is missing or not as long as the index says, and why. Looks at no contents, so it is quick."""
+    found = {}
+    for index in sectors:
+        path, expected = dataset.sector_path(index), dataset.world.sectors[index].bytes
+        try:
+            size = path.stat().st_size
+        except OSError as error:
+            found[index] = f"{path}: expected {expected} bytes, found {error.strerror}; bake it again"
+            continue
+        if size != expected:
+            found[index] = f"{path}: expected {expected} bytes, found {size}; bake it again"
+    return found

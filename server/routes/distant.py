@@ -3,9 +3,9 @@
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
-from gi_core.distant import Distant
 
 from gi_core.constants import SECTOR_SIZE_M
+from gi_core.engine import Distant
 from server.caching import Body, conditional, strong_etag
 from server.dependencies import DistantQuery, ServiceDep
 from server.encoding import MEDIA_TYPE, REPLY_VERSION, half_scale, half_texels, header_json, npy
@@ -17,24 +17,23 @@ router = APIRouter(prefix="/v1", tags=["light"])
 def distant(request: Request, service: ServiceDep, query: Annotated[DistantQuery, Query()]) -> Response:
     """Irradiance [lx] of one cube per sector, float32 (rows, cols, 6, 3); texel (0, 0) at the sector grid's north-west corner.
 
-    Rows go south (+Z), columns east (+X). `raw`: little-endian halves (rows, cols, 6, 4); lux = rgb x scale. `Gi-Distant` has the origin.
+    Rows go south (+Z), columns east (+X). `raw`: little-endian halves (rows, cols, 6, 4); lux = rgb x scale; alpha is 0 where no
+    sector was baked. `Gi-Distant` has the origin.
     """
     light = service.lighting(query.time, query.weather)
     etag = strong_etag("distant", REPLY_VERSION, service.dataset.digest, light.digest, query.format, query.encoding)
 
     def compute() -> Body:
-        with service.engine_turn() as engine:
-            found = engine.distant(light)
-        return distant_body(found, query)
+        return distant_body(service.engine.distant(light), query)
 
     return conditional(request, etag, compute)
 
 
 def distant_body(found: Distant, query: DistantQuery) -> Body:
     """The texture in the format that was asked for, with its place in the world."""
-    values, origin = found.values, found.origin_sector
+    values, origin = found.values, found.origin
     scale = 1.0 if query.format == "npy" else half_scale(values)
-    content = npy(values) if query.format == "npy" else half_texels(values, scale)
+    content = npy(values) if query.format == "npy" else half_texels(values, scale, found.valid[..., None])
     facts = {
         "origin_sector": [origin.x, origin.z],
         "origin": [float(v) for v in origin.origin],

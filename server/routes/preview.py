@@ -4,10 +4,10 @@ from typing import Annotated
 
 import numpy as np
 from fastapi import APIRouter, Query, Request, Response
-from gi_core.volume import Volume
 
 from gi_core.arrays import Float64
 from gi_core.lighting import Lighting
+from gi_core.volume import Volume
 from server import tonemap
 from server.caching import Body, conditional, strong_etag
 from server.dependencies import PreviewQuery, ServiceDep, parse_vector
@@ -33,8 +33,7 @@ def picture(service: Service, query: PreviewQuery, light: Lighting) -> bytes:
 
     def volume_at(position: Float64) -> Volume:
         # A tile's centre may lie beyond the world's edge though its pixels do not.
-        with service.engine_turn() as engine:
-            return engine.volume(np.clip(position, bounds[0], bounds[1]), light)
+        return service.engine.volume(np.clip(position, bounds[0], bounds[1]), light)
 
     with service.preview_turn():
         scene = service.preview_scenes.around(camera.eye, camera.look)

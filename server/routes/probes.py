@@ -19,17 +19,16 @@ def probes(request: Request, service: ServiceDep, query: Annotated[ProbesQuery, 
     etag = strong_etag("probes", REPLY_VERSION, service.dataset.digest, light.digest, query.model_dump())
 
     def compute() -> Body:
-        with service.engine_turn() as engine:
-            found = engine.probes(query.position, query.radius, light)
+        found = service.engine.probes(query.position, query.radius, light)
         shown = [
             ProbeReply(
-                sector=(probe.sector.x, probe.sector.z),
-                position=vector3(probe.position),
-                cube=[vector3(face) for face in probe.cube],
-                room=int(probe.room),
-                flags=int(probe.flags),
+                sector=(sector.x, sector.z),
+                position=vector3(position),
+                cube=[vector3(face) for face in cube],
+                room=int(room),
+                flags=int(flags),
             )
-            for probe in found
+            for sector, position, cube, room, flags in zip(found.sectors, found.position, found.cubes, found.room, found.flags, strict=True)
         ]
         reply = ProbesReply(time=light.time, weather=light.weather, probes=shown)
         return Body(reply.model_dump_json().encode(), "application/json")

@@ -4,9 +4,9 @@ from collections.abc import Mapping
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response
-from gi_core.volume import Volume
 
 from gi_core.constants import VOXEL_INDOORS, VOXEL_OUTDOORS
+from gi_core.volume import Volume
 from server.caching import Body, conditional, strong_etag
 from server.dependencies import ServiceDep, VolumeQuery
 from server.encoding import MEDIA_TYPE, REPLY_VERSION, half_scale, half_texels, header_json, npy
@@ -26,8 +26,7 @@ def volume(request: Request, service: ServiceDep, query: Annotated[VolumeQuery, 
     etag = strong_etag("volume", REPLY_VERSION, service.dataset.digest, light.digest, query.model_dump(exclude={"time", "weather"}))
 
     def compute() -> Body:
-        with service.engine_turn() as engine:
-            found = engine.volume(query.position, light)
+        found = service.engine.volume(query.position, light)
         return mask_body(found, query) if query.mask else light_body(found, query)
 
     return conditional(request, etag, compute)
@@ -61,7 +60,7 @@ def volume_facts(found: Volume, shape: tuple[int, ...], dtype: str, scale: float
         "unit": "lx",
         "scale": scale,
         "sectors": [[index.x, index.z] for index in found.sectors],
-        "valid": round(float(found.valid), 6),
+        "valid": round(found.valid, 6),
         "expected_error": found.expected_error,
     }
 

@@ -1,0 +1,113 @@
+"""A tiny baked city behind a real socket."""
+
+import contextlib
+import json
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+import uvicorn
+from fastapi import FastAPI
+
+from server.app import create_app
+from server.settings import Settings
+
+SOURCE = "procedural:midtown?blocks=1x1&seed=1"
+STARTUP_S = 60.0  # a fresh process builds its kernels, on a machine that may be busy
+
+Serving = Callable[[FastAPI], AbstractContextManager[httpx.Client]]
+RunCommand = Callable[..., "subprocess.CompletedProcess[str]"]
+
+
+@pytest.fixture(scope="session")
+def city(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset of one block."""
+    from bake_jobs.runner import bake
+
+    output = tmp_path_factory.mktemp("city") / "block"
+    bake(SOURCE, output, "draft", 1, None, 0, False)
+    return output
+
+
+@contextlib.contextmanager
+def _serving(app: FastAPI) -> Iterator[httpx.Client]:
+    listener = socket.create_server(("127.0.0.1", 0))
+    server = uvicorn.Server(uvicorn.Config(app, log_level="critical"))
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
+    thread.start()
+    try:
+        deadline = time.monotonic() + STARTUP_S
+        while not server.started:
+            assert thread.is_alive(), "the server ended"
+            assert time.monotonic() < deadline, "the server did not start"
+            time.sleep(0.01)
+        with httpx.Client(base_url=f"http://127.0.0.1:{listener.getsockname()[1]}", timeout=60) as client:
+            yield client
+    finally:
+        server.should_exit = True
+        thread.join(10)
+        listener.close()
+
+
+@pytest.fixture(scope="session")
+def serving() -> Serving:
+    """Serves an application over a socket for as long as a ``with`` block lasts."""
+    return _serving
+
+
+@pytest.fixture(scope="session")
+def app(city: Path) -> FastAPI:
+    return create_app(city, Settings())
+
+
+@pytest.fixture(scope="session")
+def http(app: FastAPI) -> Iterator[httpx.Client]:
+    """A client of a server of the tiny city."""
+    with _serving(app) as client:
+        yield client
+
+
+@pytest.fixture(scope="session")
+def moment() -> dict[str, Any]:
+    return {"time": "12:00", "weather": "clear"}
+
+
+@pytest.fixture(scope="session")
+def place(http: httpx.Client) -> dict[str, Any]:
+    """Query parameters of a point in the street, in the middle of the first probe's sector."""
+    world = http.get("/v1/world").json()["bounds"]
+    low, high = world["minimum"], world["maximum"]
+    return {"x": (low[0] + high[0]) / 2, "y": low[1] + 10.0, "z": (low[2] + high[2]) / 2}
+
+
+@pytest.fixture(scope="session")
+def problem_of() -> Callable[[httpx.Response], dict[str, Any]]:
+    """Checks that a reply is a whole problem document and returns it."""
+
+    def check(reply: httpx.Response) -> dict[str, Any]:
+        assert reply.headers["content-type"] == "application/problem+json", (reply.status_code, reply.text[:300])
+        body: dict[str, Any] = json.loads(reply.content)
+        assert body["status"] == reply.status_code
+        assert all(body[name] for name in ("title", "code", "detail"))
+        return body
+
+    return check
+
+
+@pytest.fixture(scope="session")
+def sectorlight() -> RunCommand:
+    """Runs the command line in a process of its own."""
+
+    def run(*arguments: str, timeout: float = 60.0) -> "subprocess.CompletedProcess[str]":
+        command = [sys.executable, "-c", "from server.cli import main; main()", *arguments]
+        return subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False)
+
+    return run

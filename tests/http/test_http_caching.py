@@ -1,0 +1,123 @@
+"""The same query is the same bytes under the same ETag, and a client that has them costs nothing."""
+
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from fastapi import FastAPI
+
+QUERIES: list[tuple[str, dict[str, Any]]] = [
+    ("/v1/world", {}),
+    ("/v1/sectors", {}),
+    ("/v1/lighting", {"moment": True}),
+    ("/v1/sky", {"moment": True}),
+    ("/v1/volume", {"moment": True, "place": True}),
+    ("/v1/volume", {"moment": True, "place": True, "mask": 1}),
+    ("/v1/volume", {"moment": True, "place": True, "format": "raw"}),
+    ("/v1/distant", {"moment": True}),
+    ("/v1/probes", {"moment": True, "place": True, "radius": 20}),
+    ("/v1/preview.png", {"moment": True, "eye": "-10,20,-10", "look": "30,0,30", "width": 64}),
+]
+
+
+def parameters(query: dict[str, Any], moment: dict[str, Any], place: dict[str, Any]) -> dict[str, Any]:
+    chosen = {name: value for name, value in query.items() if name not in ("moment", "place")}
+    return chosen | (moment if "moment" in query else {}) | (place if "place" in query else {})
+
+
+@pytest.mark.parametrize(("path", "query"), QUERIES, ids=[f"{p} {len(q)}" for p, q in QUERIES])
+def test_repeats_are_equal_and_304(
+    http: httpx.Client, moment: dict[str, Any], place: dict[str, Any], path: str, query: dict[str, Any]
+) -> None:
+    wanted = parameters(query, moment, place)
+    first, second = http.get(path, params=wanted), http.get(path, params=wanted)
+    assert first.status_code == 200
+    assert first.content == second.content
+    assert first.headers["etag"] == second.headers["etag"]
+    assert "max-age" in first.headers["cache-control"]
+    for condition in (first.headers["etag"], f'"other", W/{first.headers["etag"]}', "*"):
+        unchanged = http.get(path, params=wanted, headers={"If-None-Match": condition})
+        assert (unchanged.status_code, unchanged.content) == (304, b"")
+        assert unchanged.headers["etag"] == first.headers["etag"]
+    assert http.get(path, params=wanted, headers={"If-None-Match": '"other"'}).content == first.content
+
+
+def test_whatever_changes_the_reply_changes_the_etag(http: httpx.Client, moment: dict[str, Any], place: dict[str, Any]) -> None:
+    base = {**moment, **place}
+    variants = [{}, {"time": "12:05"}, {"weather": "overcast"}, {"x": place["x"] + 8}, {"mask": 1}, {"format": "raw"}]
+    etags = [http.get("/v1/volume", params={**base, **variant}).headers["etag"] for variant in variants]
+    assert len(set(etags)) == len(etags)
+
+
+def test_two_spellings_of_one_moment_share_an_etag(http: httpx.Client, place: dict[str, Any]) -> None:
+    date = http.get("/v1/world").json()["location"]["date"]
+    replies = [http.get("/v1/volume", params={**place, "time": time, "weather": "clear"}) for time in ("12:00", f"{date}T12:00:00")]
+    assert replies[0].headers["etag"] == replies[1].headers["etag"]
+    assert replies[0].content == replies[1].content
+
+
+def test_a_client_that_has_the_volume_costs_no_relighting(
+    http: httpx.Client, app: FastAPI, moment: dict[str, Any], place: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    etag = http.get("/v1/volume", params={**moment, **place}).headers["etag"]
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("the engine was asked")
+
+    monkeypatch.setattr(app.state.service.engine, "volume", refuse)
+    assert http.get("/v1/volume", params={**moment, **place}, headers={"If-None-Match": etag}).status_code == 304
+    assert http.get("/v1/volume", params={**moment, **place}).status_code == 500  # so the refusal above does work
+
+
+def first_sector(http: httpx.Client) -> tuple[str, bytes, str]:
+    href = http.get("/v1/sectors").json()["sectors"][0]["href"]
+    reply = http.get(href)
+    return href, reply.content, reply.headers["etag"]
+
+
+def test_sector_files_are_immutable(http: httpx.Client) -> None:
+    href, _, etag = first_sector(http)
+    assert "immutable" in http.get(href).headers["cache-control"]
+    unchanged = http.get(href, headers={"If-None-Match": etag})
+    assert (unchanged.status_code, unchanged.content) == (304, b"")
+
+
+@pytest.mark.parametrize(
+    ("header", "part"), [("0-9", slice(0, 10)), ("5-", slice(5, None)), ("-7", slice(-7, None)), ("0-99999999", slice(None))]
+)
+def test_ranges(http: httpx.Client, header: str, part: slice) -> None:
+    href, whole, _ = first_sector(http)
+    reply = http.get(href, headers={"Range": f"bytes={header}"})
+    assert reply.status_code == 206
+    assert reply.content == whole[part]
+    start, stop, _ = part.indices(len(whole))
+    assert reply.headers["content-range"] == f"bytes {start}-{stop - 1}/{len(whole)}"
+
+
+@pytest.mark.parametrize("header", ["bytes=9-2", "bytes=-", "bytes=0-1,4-5", "lines=0-1", "bytes=x", "bytes=" + "9" * 40 + "-"])
+def test_what_is_no_single_range_means_the_whole(http: httpx.Client, header: str) -> None:
+    href, whole, _ = first_sector(http)
+    reply = http.get(href, headers={"Range": header})
+    assert (reply.status_code, reply.content) == (200, whole)
+
+
+@pytest.mark.parametrize("header", ["bytes=999999999-", "bytes=-0"])
+def test_a_range_beyond_the_file_is_416(http: httpx.Client, header: str) -> None:
+    href, whole, _ = first_sector(http)
+    reply = http.get(href, headers={"Range": header})
+    assert (reply.status_code, reply.headers["content-type"]) == (416, "application/problem+json")
+    assert reply.headers["content-range"] == f"bytes */{len(whole)}"
+
+
+def test_a_range_of_another_version_gets_the_whole(http: httpx.Client) -> None:
+    href, whole, etag = first_sector(http)
+    assert http.get(href, headers={"Range": "bytes=0-3", "If-Range": '"another"'}).content == whole
+    assert http.get(href, headers={"Range": "bytes=0-3", "If-Range": etag}).content == whole[:4]
+
+
+def test_the_etag_of_a_sector_is_that_of_its_file(http: httpx.Client, city: Path) -> None:
+    listed = {entry["href"]: entry["digest"] for entry in http.get("/v1/sectors").json()["sectors"]}
+    assert len(set(listed.values())) == len(listed) == len(list((city / "sectors").glob("*.gisec")))
+    for href, digest in listed.items():
+        assert http.get(href).headers["etag"] == f'"{digest}"'

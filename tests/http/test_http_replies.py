@@ -1,0 +1,163 @@
+"""Every route's good answer, read as a client reads it."""
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from gi_core.constants import VOLUME_SHAPE, VOXEL_SIZE_M
+
+
+def array(reply: httpx.Response) -> np.ndarray:
+    assert reply.status_code == 200, reply.text[:300]
+    return np.load(io.BytesIO(reply.content), allow_pickle=False)
+
+
+def test_the_process_is_alive_and_ready(http: httpx.Client) -> None:
+    assert http.get("/healthz").json() == {"status": "alive"}
+    ready = http.get("/readyz")
+    assert ready.status_code == 200
+    assert ready.json()["status"] == "ready"
+    assert ready.json()["device"]
+
+
+def test_the_api_documents_every_route(http: httpx.Client) -> None:
+    paths = set(http.get("/openapi.json").json()["paths"])
+    assert paths >= {"/healthz", "/readyz", "/v1/world", "/v1/lighting", "/v1/sky", "/v1/volume", "/v1/distant", "/v1/sectors"}
+    assert paths >= {"/v1/sectors/{x},{z}", "/v1/probes", "/v1/preview.png"}
+    assert http.get("/docs").status_code == 200
+
+
+def test_the_viewer_loads_nothing_from_elsewhere(http: httpx.Client) -> None:
+    page = http.get("/")
+    assert page.headers["content-type"].startswith("text/html")
+    assert "//" not in page.text.replace("<!doctype html>", "")
+    for name in ("viewer.js", "viewer.css"):
+        assert f'"viewer/{name}"' in page.text
+        assert http.get(f"/viewer/{name}").status_code == 200
+
+
+def test_the_world_says_what_may_be_asked(http: httpx.Client) -> None:
+    world = http.get("/v1/world").json()
+    assert {"clear", "partly_cloudy", "overcast"} <= set(world["weather"])
+    assert (np.array(world["bounds"]["minimum"]) < world["bounds"]["maximum"]).all()
+    assert world["sectors"]["count"] == len(http.get("/v1/sectors").json()["sectors"]) > 0
+    assert world["sectors"]["size_m"] == 64
+    assert world["dataset"]["digest"] == http.get("/readyz").json()["dataset"]
+
+
+def test_every_weather_that_the_world_lists_gives_light(http: httpx.Client) -> None:
+    for weather in http.get("/v1/world").json()["weather"]:
+        light = http.get("/v1/lighting", params={"time": "12:00", "weather": weather})
+        assert light.status_code == 200
+        assert max(light.json()["sky_cube"][2]) > 100
+
+
+def test_lighting_has_the_contract_s_fields(http: httpx.Client, moment: dict[str, Any]) -> None:
+    light = http.get("/v1/lighting", params=moment).json()
+    assert set(light) == {"time", "weather", "sun", "moon", "sky_cube", "snow", "fog", "exposure"}
+    for name in ("sun", "moon"):
+        assert np.linalg.norm(light[name]["direction"]) == pytest.approx(1, abs=1e-6)
+        assert np.shape(light[name]["irradiance"]) == (3,)
+    assert np.shape(light["sky_cube"]) == (6, 3)
+
+
+def test_the_sky_integrates_to_the_sky_cube(http: httpx.Client, moment: dict[str, Any]) -> None:
+    sky = array(http.get("/v1/sky", params=moment))
+    assert sky.shape == (64, 128, 3)
+    assert sky.dtype == np.float32
+    assert (sky[:32] > 0).all()
+    assert not sky[32:].any()
+    polar = np.pi * (np.arange(64) + 0.5) / 64
+    weight = np.sin(polar) * np.maximum(np.cos(polar), 0) * (np.pi / 64) * (2 * np.pi / 128)
+    up = http.get("/v1/lighting", params=moment).json()["sky_cube"][2]
+    # rtol 1e-3: midpoint rule over rows of 2.8 degrees
+    np.testing.assert_allclose((sky * weight[:, None, None]).sum((0, 1)), up, rtol=1e-3)
+
+
+def test_a_volume_is_where_its_header_says(http: httpx.Client, moment: dict[str, Any], place: dict[str, Any]) -> None:
+    reply = http.get("/v1/volume", params={**moment, **place})
+    values, facts = array(reply), json.loads(reply.headers["Gi-Volume"])
+    assert values.shape == (6, *VOLUME_SHAPE, 3) == tuple(facts["shape"])
+    assert values.dtype == np.float32
+    assert np.isfinite(values).all()
+    assert (values >= 0).all()
+    assert (facts["basis"], facts["unit"], facts["scale"]) == ("cube", "lx", 1.0)
+    assert facts["voxel_size"] == [VOXEL_SIZE_M] * 3
+    assert facts["sectors"]
+    assert 0 < facts["valid"] <= 1
+    origin = np.array(facts["origin"])
+    centre = origin + VOXEL_SIZE_M * (np.array([32, 16, 32]) - 1) / 2
+    assert (np.abs(centre - [place["x"], place["y"], place["z"]]) <= VOXEL_SIZE_M).all()
+    # The lattice's centres are at (i + 0.5) voxels; 3.125 and these indices are exact in binary.
+    assert ((origin / VOXEL_SIZE_M - 0.5) % 1 == 0).all()
+
+
+def test_the_mask_counts_what_the_header_calls_valid(http: httpx.Client, moment: dict[str, Any], place: dict[str, Any]) -> None:
+    reply = http.get("/v1/volume", params={**moment, **place, "mask": 1})
+    mask, facts = array(reply), json.loads(reply.headers["Gi-Volume"])
+    assert mask.dtype == np.uint8
+    assert mask.shape == VOLUME_SHAPE == tuple(facts["shape"])
+    assert set(np.unique(mask)) <= {0, 1, 2, 3}
+    # abs 1e-6: the header rounds to six digits
+    assert facts["valid"] == pytest.approx(np.isin(mask, (1, 2)).mean(), abs=1e-6)
+    raw = http.get("/v1/volume", params={**moment, **place, "mask": 1, "format": "raw"})
+    assert raw.content == mask.tobytes()
+
+
+def test_noon_lights_the_street_from_above(http: httpx.Client, moment: dict[str, Any], place: dict[str, Any]) -> None:
+    values = array(http.get("/v1/volume", params={**moment, **place}))
+    free = np.isin(array(http.get("/v1/volume", params={**moment, **place, "mask": 1})), (1, 2))
+    assert 100 < np.median(values[2][free]) < 200e3
+    # At midnight the same street has less than a thousandth: no sun, no lamps.
+    night = array(http.get("/v1/volume", params={**place, "time": "00:30", "weather": "clear"}))
+    assert np.median(night[2][free]) < 1e-3 * np.median(values[2][free])
+
+
+@pytest.mark.parametrize("time", ["12:00", "00:30"])
+def test_raw_halves_are_the_exact_volume_rounded(http: httpx.Client, place: dict[str, Any], time: str) -> None:
+    query = {**place, "time": time, "weather": "clear"}
+    values = array(http.get("/v1/volume", params=query))
+    raw = http.get("/v1/volume", params={**query, "format": "raw", "encoding": "f16"})
+    facts = json.loads(raw.headers["Gi-Volume"])
+    texels = np.frombuffer(raw.content, "<f2").reshape(facts["shape"])
+    # rtol 2^-11: rounding of a half; atol: half of the smallest subnormal half
+    np.testing.assert_allclose(texels[..., :3] * np.float32(facts["scale"]), values, rtol=2**-11, atol=2**-25 * facts["scale"])
+    mask = array(http.get("/v1/volume", params={**query, "mask": 1}))
+    assert (texels[..., 3] == np.isin(mask, (1, 2))).all()
+
+
+def test_distant_covers_the_sector_grid(http: httpx.Client, moment: dict[str, Any]) -> None:
+    reply = http.get("/v1/distant", params=moment)
+    values, facts = array(reply), json.loads(reply.headers["Gi-Distant"])
+    grid = http.get("/v1/world").json()["sectors"]
+    columns, rows = (np.array(grid["maximum"]) - grid["minimum"] + 1).tolist()
+    assert values.shape == (rows, columns, 6, 3)
+    assert facts["origin_sector"] == grid["minimum"]
+    assert facts["origin"] == [64 * grid["minimum"][0], 0, 64 * grid["minimum"][1]]
+    assert values.max() > 100
+    raw = http.get("/v1/distant", params={**moment, "format": "raw"})
+    raw_facts = json.loads(raw.headers["Gi-Distant"])
+    texels = np.frombuffer(raw.content, "<f2").reshape(raw_facts["shape"])
+    np.testing.assert_allclose(texels[..., :3] * np.float32(raw_facts["scale"]), values, rtol=2**-11, atol=2**-25 * raw_facts["scale"])
+
+
+def test_probes_are_within_the_radius(http: httpx.Client, moment: dict[str, Any], place: dict[str, Any]) -> None:
+    found = http.get("/v1/probes", params={**moment, **place, "radius": 40}).json()["probes"]
+    assert found
+    position = np.array([probe["position"] for probe in found])
+    # abs 1e-3: positions are float32 metres
+    assert (np.linalg.norm(position - [place["x"], place["y"], place["z"]], axis=1) <= 40 + 1e-3).all()
+    assert np.array([probe["cube"] for probe in found]).shape[1:] == (6, 3)
+
+
+def test_sector_files_are_the_baked_bytes(http: httpx.Client, city: Path) -> None:
+    for entry in http.get("/v1/sectors").json()["sectors"]:
+        x, z = entry["sector"]
+        reply = http.get(entry["href"])
+        assert reply.content == (city / "sectors" / f"{x}_{z}.gisec").read_bytes()
+        assert len(reply.content) == entry["bytes"]
