@@ -130,12 +130,12 @@ def compare_dataset(
 
 
 def choose_sectors(dataset: Dataset, seed: int, count: int = DEFAULT_SECTORS) -> list[SectorIndex]:
-    """``count`` sectors with probes, drawn from those whose eight neighbours are in the dataset where there are enough."""
+    """At most ``count`` sectors with probes, drawn from those whose eight neighbours are in the dataset too, when any are."""
     known = dataset.world.sectors
     with_probes = [index for index in sorted(known) if known[index].probes]
     around = [(dx, dz) for dx in (-1, 0, 1) for dz in (-1, 0, 1)]
     inner = [i for i in with_probes if all(SectorIndex(i.x + dx, i.z + dz) in known for dx, dz in around)]
-    pool = inner if len(inner) >= min(count, len(with_probes)) else inner or with_probes
+    pool = inner or with_probes
     if not pool:
         raise InputError(f"{dataset.path}: no sector has a probe, so there is nothing to compare")
     picks = np.random.default_rng(seed).choice(len(pool), min(count, len(pool)), replace=False)
@@ -187,21 +187,25 @@ def _compare_surfaces(
     effort: Effort,
 ) -> None:
     """Both stages on surfaces share their reference."""
-    sampled_at = points.surface + CLIENT_OFFSET_M * points.normal
+    normal = points.normal.astype(np.float32)
+
+    def as_client(values: Float32) -> Float32:
+        return sample_volume(values, volume.origin, volume.voxel_size, points.surface, normal)
+
     reference = tracer.surface_irradiance(points.surface, points.normal, lighting, samples=effort.samples, seed=effort.seed)
-    shaded.add(sample_volume(volume.values, volume.origin, volume.voxel_size, sampled_at, points.normal), reference)
+    shaded.add(as_client(volume.values), reference)
     if not points.open_voxel.any():
         return
-    corner = corner_voxels(sampled_at, volume.origin).reshape(-1, 3)
+    corner = corner_voxels(points.surface + CLIENT_OFFSET_M * points.normal, volume.origin).reshape(-1, 3)
     corner = np.unique(corner, axis=0)
     source = nearest_open_voxel(points.open_voxel)[:, *corner.T].T
     needed, which = np.unique(source, axis=0, return_inverse=True)
     exact = _cubes(tracer, voxel_centre(needed[:, [2, 0, 1]] + volume.first_voxel), lighting, effort)
     values = np.zeros((6, *VOLUME_SHAPE, 3), np.float32)
     values[:, *corner.T] = exact.mean[which.reshape(-1)].transpose(1, 0, 2)
-    rebuilt = sample_volume(values, volume.origin, volume.voxel_size, sampled_at, points.normal)
+    rebuilt = as_client(values)
     noise = np.zeros((6, *VOLUME_SHAPE, 3), np.float32)
     noise[:, *corner.T] = exact.standard_error[which.reshape(-1)].transpose(1, 0, 2)
     # Corners' errors are independent, so their weighted sum overstates the noise: an upper bound.
-    rebuilt_noise = sample_volume(noise, volume.origin, volume.voxel_size, sampled_at, points.normal)
+    rebuilt_noise = as_client(noise)
     floor.add(rebuilt, Estimate(reference.mean, np.hypot(reference.standard_error, rebuilt_noise)))

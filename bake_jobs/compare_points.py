@@ -1,7 +1,8 @@
 """Where a sector is compared with the path tracer: chosen by casting rays into the mesh, without asking the bake what it thinks.
 
-A point counts as open air when some of the sky is seen from it. Inside a solid none is, however the mesh is wound and whether
-or not it has a bottom; what an overlapping part buries drops out by the same test.
+A point counts as open air when it sees some of the sky, and something below it. Inside a solid there is no sky, however the mesh is
+wound and whether or not it has a bottom; what an overlapping part buries drops out by the same test. Under the ground there is
+nothing below, though sky may show past the edge of the world.
 """
 
 from dataclasses import dataclass
@@ -24,15 +25,17 @@ MID_M = 6.0
 LOOK_DIRECTIONS = 192
 # Of the 96 upward rays. One may slip through the hair-wide cracks between sectors' cut geometries; two do not.
 SKY_RAYS_MIN = 2
+# Of the 96 downward rays. Above the very corner of the world's ground a quarter of them meets it; under the ground none does.
+GROUND_RAYS_MIN = 10
 _POINTS_AT_ONCE = 2048
 
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """distance : (n,) [m] to the nearest surface met by the look-around rays; sees_sky : (n,) bool, the point is in open air."""
+    """distance : (n,) [m] to the nearest surface met by the look-around rays; open_air : (n,) bool."""
 
     distance: Float64
-    sees_sky: Bool
+    open_air: Bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,15 +63,15 @@ def choose_points(rays: RayScene, geometry: Geometry, sector: Sector, count: int
     """At most ``count`` points of each kind in one sector."""
     eye = standing_eye(rays, sector.index, geometry)
     first = volume_first_voxel(eye)
-    index = np.stack(np.indices(VOLUME_SHAPE), axis=-1).reshape(-1, 3)  # (y, z, x)
+    index = np.argwhere(np.ones(VOLUME_SHAPE, bool))  # (y, z, x)
     centre = voxel_centre(index[:, [2, 0, 1]] + first)
     seen = look_around(rays, centre)
     origin = sector.index.origin
     in_sector = ((centre >= origin) & (centre < origin + SECTOR_SIZE_M))[:, [0, 2]].all(axis=1)
-    free = seen.sees_sky & in_sector
+    free = seen.open_air & in_sector
     probe_position = sector.probe_position.astype(np.float64) + origin
     outdoors = (sector.probe_room == ROOM_OUTDOORS) & (sector.probe_flags & PROBE_IN_MARGIN == 0)
-    probe = _some(np.flatnonzero(outdoors & look_around(rays, probe_position).sees_sky), count, rng)
+    probe = _some(np.flatnonzero(outdoors & look_around(rays, probe_position).open_air), count, rng)
     surface, normal = _surface_points(rays, geometry, (voxel_centre(first), VOLUME_SHAPE), count, rng)
     return SectorPoints(
         eye=eye,
@@ -78,7 +81,7 @@ def choose_points(rays: RayScene, geometry: Geometry, sector: Sector, count: int
         mid=index[_some(np.flatnonzero(free & (seen.distance >= MID_M)), count, rng)],
         surface=surface,
         normal=normal,
-        open_voxel=seen.sees_sky.reshape(VOLUME_SHAPE),
+        open_voxel=seen.open_air.reshape(VOLUME_SHAPE),
     )
 
 
@@ -97,15 +100,16 @@ def look_around(rays: RayScene, points: Float64) -> Surroundings:
     """What surrounds points (n, 3) [m], by the same LOOK_DIRECTIONS directions from each."""
     directions = _fibonacci_sphere(LOOK_DIRECTIONS)
     upward = directions[:, 1] > 0
-    distance, sky_rays = np.empty(len(points)), np.empty(len(points), np.int64)
+    distance, open_air = np.empty(len(points)), np.empty(len(points), bool)
     for start in range(0, len(points), _POINTS_AT_ONCE):
         some = slice(start, start + _POINTS_AT_ONCE)
         origins = np.repeat(points[some], LOOK_DIRECTIONS, axis=0)
         hits = rays.closest(origins, np.tile(directions, (len(points[some]), 1)))
         lengths = hits.distance.reshape(-1, LOOK_DIRECTIONS)
         distance[some] = lengths.min(axis=1)
-        sky_rays[some] = np.isinf(lengths[:, upward]).sum(axis=1)
-    return Surroundings(distance, sky_rays >= SKY_RAYS_MIN)
+        left = np.isinf(lengths)
+        open_air[some] = (left[:, upward].sum(axis=1) >= SKY_RAYS_MIN) & ((~left[:, ~upward]).sum(axis=1) >= GROUND_RAYS_MIN)
+    return Surroundings(distance, open_air)
 
 
 def nearest_open_voxel(open_voxel: Bool) -> Int64:
@@ -119,7 +123,7 @@ def corner_voxels(points: Float64, origin: Float64) -> Int64:
     origin : (3,) [m], centre of voxel (0, 0, 0).
     """
     low = np.floor((points - origin) / VOXEL_SIZE_M).astype(np.int64)
-    corner = low[:, None, :] + np.stack(np.indices((2, 2, 2)), axis=-1).reshape(-1, 3)
+    corner = low[:, None, :] + np.argwhere(np.ones((2, 2, 2), bool))
     return np.clip(corner[..., [1, 2, 0]], 0, np.array(VOLUME_SHAPE) - 1)
 
 
@@ -153,11 +157,11 @@ def _surface_points(
 
 
 def _open_air_off(rays: RayScene, point: Float64, normal: Float64) -> Bool:
-    """Whether the air in front of surfaces sees the sky: looked at where a client samples, or halfway to what stands closer."""
+    """Whether there is open air in front of surfaces: looked at where a client samples, or halfway to what stands closer."""
     start = point + 2 * SURFACE_OFFSET_M * normal
     free = rays.closest(start, normal).distance.astype(np.float64)
     off = np.minimum(CLIENT_OFFSET_M, free / 2)
-    return look_around(rays, start + off[:, None] * normal).sees_sky
+    return look_around(rays, start + off[:, None] * normal).open_air
 
 
 def _some(indices: Int64, count: int, rng: np.random.Generator) -> Int64:

@@ -1,0 +1,168 @@
+"""``compare`` end to end on a dataset whose light can be written down: an open plain under a uniform sky, served by a stand-in engine
+that is right, or wrong by a known factor."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from bake_jobs import compare
+from bake_jobs.compare import STAGES, choose_sectors, compare_dataset
+from gi_core.constants import VOLUME_SHAPE, VOXEL_NO_SECTOR, VOXEL_OUTDOORS, VOXEL_SOLID
+from gi_core.errors import InputError
+from gi_core.geometry_file import Geometry
+from gi_core.grid import SectorIndex, volume_first_voxel, voxel_centre
+from gi_core.lighting import DirectionalLight, Lighting
+from gi_core.volume import Volume
+from gi_core.world import Location
+
+SKY, ALBEDO, GROUND_M = 1000.0, 0.3, 2.0
+PLAIN = {SectorIndex(x, z): SimpleNamespace(probes=4) for x in range(-9, 9) for z in range(-9, 9)}
+
+
+def plain_cube():
+    """+X -X +Y -Y +Z -Z over an endless plain under a uniform sky."""
+    side = np.pi / 2 * SKY * (1 + ALBEDO)
+    faces = [side, side, np.pi * SKY, np.pi * ALBEDO * SKY, side, side]
+    return np.repeat(np.array(faces, np.float32)[:, None], 3, axis=1)
+
+
+class PlainDataset:
+    """Sectors of bare ground, four probes each."""
+
+    path = "plain"
+
+    def __init__(self, sectors=PLAIN):
+        self.world = SimpleNamespace(preset="talk", basis="cube", location=Location(), sectors=sectors, bake_id="ab")
+
+    def geometry(self, index):
+        corners = index.origin + 64 * np.array([[0, 0, 0], [0, 0, 1], [1, 0, 1], [1, 0, 0]]) + [0, GROUND_M, 0]
+        return Geometry(
+            corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32), np.full((2, 3), ALBEDO, np.float32), np.zeros((2, 3), np.float32)
+        )
+
+    def sector(self, index):
+        position = np.array([[8, 4, 8], [50, 4, 8], [8, 9, 50], [50, 14, 50]], np.float32)
+        return SimpleNamespace(index=index, probe_position=position, probe_room=np.zeros(4, np.uint16), probe_flags=np.zeros(4, np.uint8))
+
+
+def plain_engine(factor=1.0, no_sector_from=32, solid_from=32):
+    """Serves the plain's light times a factor. Voxel columns from an x index on are without a sector, or called solid."""
+
+    class Engine:
+        def __init__(self, dataset, device):
+            pass
+
+        def lighting(self, time, weather):
+            sky = np.zeros((64, 128, 3), np.float32)
+            sky[:32] = SKY
+            dark = DirectionalLight(np.array([0.0, 1.0, 0.0]), np.zeros(3))
+            return Lighting(time, weather, dark, dark, sky, np.zeros((6, 3)), 0.0, 0.0, 0.0)
+
+        def lit_sector(self, index, lighting):
+            return factor * np.repeat(plain_cube()[None], 4, axis=0)
+
+        def volume(self, position, lighting):
+            first = volume_first_voxel(position)
+            values = factor * np.broadcast_to(plain_cube()[:, None, None, None], (6, *VOLUME_SHAPE, 3)).astype(np.float32)
+            mask = np.full(VOLUME_SHAPE, VOXEL_OUTDOORS, np.uint8)
+            heights = voxel_centre(first + np.arange(VOLUME_SHAPE[0])[:, None])[:, 1]
+            mask[heights < GROUND_M] = VOXEL_SOLID
+            mask[:, :, solid_from:] = VOXEL_SOLID
+            mask[:, :, no_sector_from:] = VOXEL_NO_SECTOR
+            return Volume(values, mask, first, ())
+
+    return Engine
+
+
+@pytest.fixture
+def run(monkeypatch):
+    def compare_plain(engine=None, states=("noon",), **options):
+        monkeypatch.setattr(compare.Dataset, "open", lambda path: PlainDataset())
+        monkeypatch.setattr(compare, "Engine", engine or plain_engine())
+        options = {"sectors": [SectorIndex(0, 0)], "points_per_sector": 12, "samples": 1024} | options
+        return compare_dataset("plain", states, **options)
+
+    return compare_plain
+
+
+# The plain ends 576 m out, where 1024 paths begin to see below the horizon: under 1 % of a side's light. Noise adds its share.
+CLOSE = 0.015
+
+
+def test_right_light_has_no_error_at_any_stage(run):
+    report = run()
+    for stage in STAGES:
+        numbers = report["states"]["noon"][stage]
+        assert numbers["n"] >= 12
+        assert numbers["median"] < CLOSE, stage
+        assert abs(numbers["bias"]) < CLOSE, stage
+        assert numbers["noise"] < 0.01
+    assert report["preset"] == "talk"
+    assert report["basis"] == "cube"
+    assert report["open_air_called_solid"] == 0
+
+
+def test_wrong_light_shows_everywhere_but_in_the_floor(run):
+    stages = run(plain_engine(1.25))["states"]["noon"]
+    for stage in STAGES[:-1]:
+        assert stages[stage]["bias"] == pytest.approx(0.25, abs=CLOSE), stage
+        assert stages[stage]["median"] == pytest.approx(0.25, abs=CLOSE), stage
+    assert stages["floor"]["median"] < CLOSE
+
+
+def test_black_light_is_wholly_wrong(run):
+    stages = run(plain_engine(0.0))["states"]["noon"]
+    assert all(stages[stage]["bias"] == -1 for stage in STAGES[:-1])
+
+
+def test_the_same_arguments_give_the_same_report(run):
+    assert run(samples=64) == run(samples=64)
+    assert run(samples=64) != run(samples=64, seed=1)
+
+
+def test_voxels_without_a_sector_are_left_out_and_wrongly_solid_ones_are_counted(run):
+    whole, half = run(samples=64), run(plain_engine(no_sector_from=16), samples=64)
+    assert 0 < half["states"]["noon"]["near"]["n"] < whole["states"]["noon"]["near"]["n"]
+    assert run(plain_engine(solid_from=16), samples=64)["open_air_called_solid"] == pytest.approx(0.5)
+
+
+def test_progress_counts_every_sector_and_state(run):
+    steps = []
+    run(
+        states=("noon", "overcast"),
+        sectors=[SectorIndex(0, 0), SectorIndex(-1, 2)],
+        samples=64,
+        points_per_sector=2,
+        progress=lambda done, total, what: steps.append((done, total, what)),
+    )
+    assert steps == [
+        (1, 4, "sector 0,0 noon"),
+        (2, 4, "sector 0,0 overcast"),
+        (3, 4, "sector -1,2 noon"),
+        (4, 4, "sector -1,2 overcast"),
+    ]
+
+
+def test_sectors_are_drawn_from_the_inside():
+    picks = choose_sectors(PlainDataset(), seed=0)
+    assert len(set(picks)) == 9
+    assert all(-9 < i.x < 8 and -9 < i.z < 8 for i in picks)
+    assert picks == choose_sectors(PlainDataset(), seed=0)
+    assert picks != choose_sectors(PlainDataset(), seed=1)
+
+
+def test_a_small_bake_compares_what_it_has():
+    row = {SectorIndex(x, 0): SimpleNamespace(probes=1) for x in range(4)}
+    assert choose_sectors(PlainDataset(row), seed=0) == sorted(row)
+
+
+def test_no_probe_anywhere_is_refused():
+    with pytest.raises(InputError, match="no sector has a probe"):
+        choose_sectors(PlainDataset({SectorIndex(0, 0): SimpleNamespace(probes=0)}), seed=0)
+
+
+@pytest.mark.parametrize(("options", "said"), [({"states": ["night"]}, "expected noon"), ({"points_per_sector": 0}, "at least 1 point")])
+def test_bad_requests_are_refused(run, options, said):
+    with pytest.raises(InputError, match=said):
+        run(**options)
