@@ -25,8 +25,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from bake_jobs.config import BakeSettings, settings_for
 from bake_jobs.geometry_clip import SectorCutter
-from bake_jobs.scene import Scene
-from bake_jobs.scene_source import load_scene, scene_digest
+from bake_jobs.scene import Scene, scene_digest
+from bake_jobs.scene_source import load_scene
 from bake_jobs.sector_job import SKY_FACES, SectorBaker
 from bake_jobs.summary import print_summary
 from gi_core import distant_file, sector_file
@@ -239,7 +239,7 @@ def _run(
                 yield from (future.result() for future in finished)
         except BrokenProcessPool as error:
             raise WorkerLostError(
-                "a worker process was killed (most likely: out of memory); finished sectors are kept, start the same bake again with fewer --jobs"
+                "a worker process was killed, most likely for want of memory; finished sectors are kept: start the same bake again with fewer --jobs"
             ) from error
         finally:
             pool.shutdown(wait=True, cancel_futures=True)

@@ -1,0 +1,119 @@
+"""OpenCL device: which one, its queue, and kernels built for what a scene needs."""
+
+import os
+import warnings
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+
+from gi_core import layout, pocl_cpu
+from gi_core.errors import DeviceError, KernelBuildError
+from kernels_cl import include_directory, source
+
+ENVIRONMENT = "SECTORLIGHT_DEVICE"
+
+
+def available_devices() -> list[cl.Device]:
+    """Every OpenCL device of every platform, in the order that the loader gives."""
+    try:
+        return [device for platform in cl.get_platforms() for device in platform.get_devices()]
+    except cl.LogicError:
+        return []
+
+
+def describe(device: cl.Device) -> str:
+    """One line that names a device: platform, device, version."""
+    return f"{device.platform.name} / {device.name.strip()} ({device.platform.version.split(',')[0].strip()})"
+
+
+def choose_device(name: str | None) -> cl.Device:
+    """The device whose description contains ``name`` (any case); without one, PoCL's CPU, or else the first.
+
+    Raises DeviceError, listing what there is, when nothing matches.
+    """
+    devices = available_devices()
+    if not devices:
+        raise DeviceError("no OpenCL device found; `pip install 'pyopencl[pocl]'` brings one that needs no driver")
+    if name:
+        for device in devices:
+            if name.lower() in describe(device).lower():
+                return device
+        raise DeviceError(f"no OpenCL device matches {name!r}; there are: {'; '.join(describe(d) for d in devices)}")
+    return next((d for d in devices if "portable computing" in d.platform.name.lower()), devices[0])
+
+
+class Device:
+    """A device with an in-order queue, and the programs built for it so far."""
+
+    def __init__(self, name: str | None = None) -> None:
+        """``name`` is part of a device's description; SECTORLIGHT_DEVICE where it is None. Raises DeviceError."""
+        self.device = choose_device(name or os.environ.get(ENVIRONMENT))
+        self.name = describe(self.device)
+        self.context = cl.Context([self.device])
+        self.queue = cl.CommandQueue(self.context)
+        self._programs: dict[tuple[str, tuple[tuple[str, int], ...]], cl.Program] = {}
+        try:
+            self._check_layout()
+        except KernelBuildError as error:
+            if not pocl_cpu.is_unknown_cpu(str(error)) or pocl_cpu.name_compatible_cpu(self.device.int_ptr) is None:
+                raise
+            self._check_layout()
+
+    def kernel(self, name: str, **defines: int) -> cl.Kernel:
+        """A new instance of kernel ``name`` of ``name.cl``, with arguments of its own; programs are built once for each set of defines.
+
+        Raises KernelBuildError with the compiler's log.
+        """
+        key = (name, tuple(sorted(defines.items())))
+        if key not in self._programs:
+            self._programs[key] = self.build(source(f"{name}.cl"), f"{name}.cl", **defines)
+        return cl.Kernel(self._programs[key], name)
+
+    def build(self, text: str, name: str, **defines: int) -> cl.Program:
+        """Compile OpenCL C with the kernels' include path. Raises KernelBuildError."""
+        options = ["-I", str(include_directory()), *(f"-D{key}={value}" for key, value in sorted(defines.items()))]
+        try:
+            with warnings.catch_warnings():
+                # PoCL logs harmless remarks on stderr, which pyopencl turns into warnings.
+                warnings.simplefilter("ignore")
+                return cl.Program(self.context, text).build(options)
+        except cl.RuntimeError as error:
+            raise KernelBuildError(f"{name} does not build on {self.name} with {defines}:\n{error}") from error
+
+    def upload(self, values: "np.ndarray[Any, Any]") -> cl.Buffer:
+        """A read-only buffer with the array's bytes; never empty, since OpenCL has no empty buffers."""
+        data = np.ascontiguousarray(values)
+        if data.nbytes == 0:
+            data = np.zeros(16, np.uint8)
+        return cl.Buffer(self.context, cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR, hostbuf=data)
+
+    def allocate(self, nbytes: int) -> cl.Buffer:
+        """A read-write buffer of zeros."""
+        buffer = cl.Buffer(self.context, cl.mem_flags.READ_WRITE, max(nbytes, 16))
+        cl.enqueue_fill_buffer(self.queue, buffer, np.uint8(0), 0, max(nbytes, 16))
+        return buffer
+
+    def read(self, buffer: cl.Buffer, into: "np.ndarray[Any, Any]") -> None:
+        """Copy a buffer into an array, after all that was enqueued before."""
+        if into.nbytes:
+            cl.enqueue_copy(self.queue, into, buffer)
+
+    def _check_layout(self) -> None:
+        """Refuse a device whose compiler lays records out differently from NumPy."""
+        writes = "\n".join(f"size[{i}] = sizeof({record.name});" for i, record in enumerate(layout.RECORDS))
+        program = self.build(f'#include "layout.h"\n__kernel void sizes(__global uint *size) {{ {writes} }}', "layout check")
+        sizes = np.zeros(len(layout.RECORDS), np.uint32)
+        buffer = self.allocate(sizes.nbytes)
+        program.sizes(self.queue, (1,), None, buffer)
+        self.read(buffer, sizes)
+        expected = [record.dtype.itemsize for record in layout.RECORDS]
+        if sizes.tolist() != expected:
+            raise KernelBuildError(f"{self.name} lays out records in {sizes.tolist()} bytes, the host in {expected}")
+
+
+@lru_cache(maxsize=4)
+def shared_device(name: str | None = None) -> Device:
+    """One Device per name for the whole process: contexts and built kernels are worth keeping."""
+    return Device(name)

@@ -1,0 +1,181 @@
+"""Answers queries about a dataset's light: deterministic, in buffers of its own, whatever else runs."""
+
+import threading
+from collections import OrderedDict
+from dataclasses import dataclass
+
+import numpy as np
+import pyopencl as cl
+
+from gi_core.arrays import Float32, Float64, UInt8, UInt16
+from gi_core.constants import VOLUME_SHAPE, VOXEL_NO_SECTOR
+from gi_core.dataset import Dataset
+from gi_core.device import shared_device
+from gi_core.errors import FormatError, OutsideWorldError
+from gi_core.grid import SectorIndex, volume_first_voxel
+from gi_core.lighting import Lighting
+from gi_core.lighting_model import make_lighting
+from gi_core.relight import Relighter, ResidentSector
+from gi_core.relight_input import relight_input, sky_face_exitance
+from gi_core.volume import SectorBox, Volume, box_mask, box_record, fill_missing_columns, plan_boxes
+
+# Device memory that queries may keep sectors in.
+RESIDENT_BYTES = 1 << 29
+# Lit sectors that are remembered, some 20 kB each.
+LIT_SECTORS = 1024
+# A volume may be asked for this far above or below what the city itself reaches.
+HEIGHT_MARGIN_M = 200.0
+
+
+@dataclass(frozen=True, eq=False)
+class Distant:
+    """One texel per sector.
+
+    values : (rows, cols, 6, 3) float32 [lx], rows towards +Z, columns towards +X
+    origin : sector of texel (0, 0)
+    valid : (rows, cols) uint8, 1 where the dataset has a sector
+    """
+
+    values: Float32
+    origin: SectorIndex
+    valid: UInt8
+
+
+@dataclass(frozen=True, eq=False)
+class LitProbes:
+    """Probes near a point. position (n, 3) [m], world frame; cubes (n, 6, 3) [lx]; room, flags (n,); sectors (n,)."""
+
+    position: Float64
+    cubes: Float32
+    room: UInt16
+    flags: UInt8
+    sectors: tuple[SectorIndex, ...]
+
+
+class Engine:
+    """Lights sectors of one dataset on one device. Safe to call from several threads; the device is used by one at a time."""
+
+    def __init__(self, dataset: Dataset, device: str | None = None) -> None:
+        """``device`` is part of an OpenCL device's description. Raises DeviceError."""
+        self.dataset = dataset
+        self.failed_sectors: dict[SectorIndex, str] = {}
+        self._device = shared_device(device)
+        self._relighter = Relighter(self._device)
+        self._lock = threading.RLock()
+        self._residents: OrderedDict[SectorIndex, ResidentSector] = OrderedDict()
+        self._lit: OrderedDict[tuple[str, SectorIndex], Float32] = OrderedDict()
+
+    @property
+    def device_name(self) -> str:
+        """The device's platform, name and version."""
+        return self._device.name
+
+    def lighting(self, time: str, weather: str) -> Lighting:
+        """Sun, moon and sky at the dataset's place. Raises UnknownTimeError, UnknownWeatherError."""
+        return make_lighting(self.dataset.world.location, time, weather)
+
+    def lit_sector(self, index: SectorIndex, lighting: Lighting) -> Float32:
+        """A sector's probe cubes (P, 6, 3) float32 [lx], bounces converged to relight.QUERY_RESIDUAL.
+
+        Raises SectorMissingError, CorruptFileError.
+        """
+        key = (lighting.digest, index)
+        with self._lock:
+            if key in self._lit:
+                self._lit.move_to_end(key)
+                return self._lit[key]
+            resident = self._resident(index)
+            cubes = self._relighter.converge(resident, relight_input(lighting, self.dataset.world.sun_table)).cubes
+            self._lit[key] = cubes
+            while len(self._lit) > LIT_SECTORS:
+                self._lit.popitem(last=False)
+            return cubes
+
+    def volume(self, position: Float64, lighting: Lighting) -> Volume:
+        """The volume centred on a world position (3,) [m]. Raises OutsideWorldError, CorruptFileError."""
+        self._expect_inside(position)
+        first = volume_first_voxel(position)
+        boxes = [box for box in plan_boxes(first) if box.index in self.dataset.world.sectors]
+        if not boxes:
+            raise OutsideWorldError(self._outside(position))
+        values = np.zeros((6, *VOLUME_SHAPE, 3), np.float32)
+        mask = np.full(VOLUME_SHAPE, VOXEL_NO_SECTOR, np.uint8)
+        with self._lock:
+            target = self._device.allocate(values.nbytes)
+            for box in boxes:
+                self._fill(box, lighting, target, mask)
+            self._device.read(target, values)
+        fill_missing_columns(values, mask)
+        report = self.dataset.world.error_report
+        expected = None if report is None else report.get("expected_error")
+        return Volume(values, mask, first, tuple(box.index for box in boxes), self.dataset.world.basis, expected)
+
+    def distant(self, lighting: Lighting) -> Distant:
+        """One texel per sector of the whole world, lit by the sky alone (slide "Distant shading"). Raises CorruptFileError."""
+        texels = self.dataset.distant()
+        values = texels.sky[..., None] * sky_face_exitance(lighting)
+        return Distant(values.astype(np.float32), texels.origin, texels.valid)
+
+    def probes(self, position: Float64, radius: float, lighting: Lighting) -> LitProbes:
+        """Probes within ``radius`` [m] of a world position (3,) [m], from every sector that the circle touches.
+
+        Raises OutsideWorldError, CorruptFileError.
+        """
+        self._expect_inside(position)
+        low, high = (np.floor((np.asarray(position) + sign * radius) / 64.0).astype(int) for sign in (-1, 1))
+        found = []
+        for z in range(low[2], high[2] + 1):
+            for x in range(low[0], high[0] + 1):
+                index = SectorIndex(x, z)
+                if index not in self.dataset.world.sectors:
+                    continue
+                with self._lock:
+                    cubes = self.lit_sector(index, lighting)
+                    sector = self._resident(index).sector
+                world = sector.probe_position + index.origin
+                near = np.flatnonzero(np.linalg.norm(world - position, axis=1) <= radius)
+                found.append((world[near], cubes[near], sector.probe_room[near], sector.probe_flags[near], [index] * len(near)))
+        if not found:
+            raise OutsideWorldError(self._outside(position))
+        position_, cubes_, room, flags = (np.concatenate([part[i] for part in found]) for i in range(4))
+        return LitProbes(position_, cubes_, room, flags, tuple(s for part in found for s in part[4]))
+
+    def _fill(self, box: SectorBox, lighting: Lighting, target: cl.Buffer, mask: UInt8) -> None:
+        cubes = self.lit_sector(box.index, lighting)
+        resident = self._resident(box.index)
+        sector = resident.sector
+        resident.write_cubes(cubes)
+        if sector.probe_count:
+            kernel = self._device.kernel("fill_volume", BASIS_SIZE=sector.basis_size, VOXEL_PROBES=sector.voxel_probe.shape[3])
+            record = self._device.upload(box_record(box, sector))
+            kernel.set_args(record, resident.voxel_probe, resident.voxel_weight, resident.cubes, target)
+            cl.enqueue_nd_range_kernel(self._device.queue, kernel, tuple(int(n) for n in box.size), None)
+        (x, y, z), (nx, ny, nz) = box.volume_first, box.size
+        mask[y : y + ny, z : z + nz, x : x + nx] = box_mask(box, sector)
+
+    def _resident(self, index: SectorIndex) -> ResidentSector:
+        found = self._residents.get(index)
+        if found is None:
+            try:
+                sector = self.dataset.sector(index)
+            except FormatError as error:
+                self.failed_sectors[index] = str(error)
+                raise
+            self.failed_sectors.pop(index, None)
+            found = self._residents[index] = ResidentSector(self._device, sector, self.dataset.world.sky_patches)
+            while len(self._residents) > 1 and sum(r.nbytes for r in self._residents.values()) > RESIDENT_BYTES:
+                self._residents.popitem(last=False)
+        self._residents.move_to_end(index)
+        return found
+
+    def _expect_inside(self, position: Float64) -> None:
+        low, high = self.dataset.world.bounds
+        if not np.isfinite(position).all() or not low[1] - HEIGHT_MARGIN_M <= position[1] <= high[1] + HEIGHT_MARGIN_M:
+            raise OutsideWorldError(self._outside(position))
+        if (position[[0, 2]] < low[[0, 2]] - 64.0).any() or (position[[0, 2]] > high[[0, 2]] + 64.0).any():
+            raise OutsideWorldError(self._outside(position))
+
+    def _outside(self, position: Float64) -> str:
+        low, high = (", ".join(f"{v:.1f}" for v in corner) for corner in self.dataset.world.bounds)
+        here = ", ".join(f"{v:g}" for v in position)
+        return f"position ({here}) is outside this world; expected x, y, z [m] within ({low}) and ({high})"

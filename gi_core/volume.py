@@ -1,0 +1,156 @@
+"""The irradiance volume around a position: 100 x 50 x 100 m in 32 x 16 x 32 voxels (slide "Irradiance volume"), and how a client
+samples it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gi_core.ambient_cube import basis_weights
+from gi_core.arrays import AnyArray, Float32, Float64, Int64, UInt8
+from gi_core.constants import VOLUME_SHAPE, VOXEL_INDOORS, VOXEL_NO_SECTOR, VOXEL_OUTDOORS, VOXEL_SIZE_M, VOXEL_SOLID
+from gi_core.grid import SectorIndex, voxel_centre, voxel_columns
+from gi_core.layout import VOLUME_BOX
+from gi_core.sector import Sector
+
+
+@dataclass(frozen=True, eq=False)
+class Volume:
+    """An irradiance volume.
+
+    values : (B, 16, 32, 32, 3) float32 [lx]: coefficient, y, z, x, channel
+    mask : (16, 32, 32) uint8: VOXEL_SOLID, VOXEL_OUTDOORS, VOXEL_INDOORS, VOXEL_NO_SECTOR
+    first_voxel : (3,) int64, world lattice index (x, y, z) of voxel (0, 0, 0)
+    sectors : those that it was filled from
+    expected_error : median relative error that the dataset's error report gives, or None without a report
+    """
+
+    values: Float32
+    mask: UInt8
+    first_voxel: Int64
+    sectors: tuple[SectorIndex, ...]
+    basis: str = "cube"
+    expected_error: float | None = None
+
+    @property
+    def origin(self) -> Float64:
+        """World position (3,) [m] of the centre of voxel (0, 0, 0)."""
+        return voxel_centre(self.first_voxel)
+
+    @property
+    def voxel_size(self) -> Float64:
+        """(3,) [m]."""
+        return np.full(3, VOXEL_SIZE_M)
+
+    @property
+    def valid(self) -> float:
+        """Share of voxels in free air, outdoors or indoors."""
+        return float(np.isin(self.mask, (VOXEL_OUTDOORS, VOXEL_INDOORS)).mean())
+
+
+@dataclass(frozen=True, eq=False)
+class SectorBox:
+    """The part of a volume that one sector fills: first indices and size along (x, y, z), y being the whole height."""
+
+    index: SectorIndex
+    volume_first: Int64
+    lattice_first: Int64
+    size: Int64
+
+
+def plan_boxes(first_voxel: Int64) -> list[SectorBox]:
+    """Which sectors a volume reads, and where each goes. Pure; together they cover the volume once."""
+    ny, nz, nx = VOLUME_SHAPE
+    columns = [_split(int(first_voxel[0]), nx), _split(int(first_voxel[2]), nz)]
+    boxes = []
+    for sector_z, z0, z1 in columns[1]:
+        for sector_x, x0, x1 in columns[0]:
+            lattice = np.array([x0, first_voxel[1], z0], np.int64)
+            boxes.append(
+                SectorBox(SectorIndex(sector_x, sector_z), lattice - first_voxel, lattice, np.array([x1 - x0, ny, z1 - z0], np.int64))
+            )
+    return boxes
+
+
+def _split(first: int, count: int) -> list[tuple[int, int, int]]:
+    """Runs (sector, first voxel, past the last) along one axis."""
+    runs = []
+    sector = int(np.floor(voxel_centre(np.int64(first)) / 64.0))
+    at = first
+    while at < first + count:
+        end = min(voxel_columns(sector)[1], first + count)
+        runs.append((sector, at, end))
+        at, sector = end, sector + 1
+    return runs
+
+
+def box_record(box: SectorBox, sector: Sector) -> AnyArray:
+    """The box as fill_volume.cl reads it: (1,) layout.VOLUME_BOX."""
+    ny, nz, nx = VOLUME_SHAPE
+    sy, sz, sx = sector.voxel_class.shape
+    record = np.zeros(1, VOLUME_BOX.dtype)
+    record["box_size"][0, :3] = box.size
+    record["volume_first"][0, :3] = box.volume_first
+    record["volume_size"][0, :3] = (nx, ny, nz)
+    record["sector_first"][0, :3] = box.lattice_first - sector.voxel_first
+    record["sector_size"][0, :3] = (sx, sy, sz)
+    return record
+
+
+def sector_slices(box: SectorBox, sector: Sector) -> tuple[AnyArray, slice, slice]:
+    """Indices (y, z, x) into a sector's voxel arrays that a box reads; heights beyond its layers read the lowest or highest."""
+    first = box.lattice_first - sector.voxel_first
+    y = np.clip(first[1] + np.arange(box.size[1]), 0, sector.voxel_class.shape[0] - 1)
+    return y, slice(int(first[2]), int(first[2] + box.size[2])), slice(int(first[0]), int(first[0] + box.size[0]))
+
+
+def box_mask(box: SectorBox, sector: Sector) -> UInt8:
+    """Voxel classes (y, z, x) of a box. Below what a sector stores is solid."""
+    y, z, x = sector_slices(box, sector)
+    mask = sector.voxel_class[y][:, z, x].copy()
+    mask[box.lattice_first[1] + np.arange(box.size[1]) < sector.voxel_first[1]] = VOXEL_SOLID
+    return mask
+
+
+def fill_missing_columns(values: Float32, mask: UInt8) -> None:
+    """Give columns without a sector the light of the nearest column that has one, in place: a volume has no black edge."""
+    missing = mask[0] == VOXEL_NO_SECTOR
+    if not missing.any() or missing.all():
+        return
+    have, lack = np.argwhere(~missing), np.argwhere(missing)
+    nearest = have[np.argmin(((lack[:, None] - have[None]) ** 2).sum(axis=2), axis=1)]
+    values[:, :, lack[:, 0], lack[:, 1]] = values[:, :, nearest[:, 0], nearest[:, 1]]
+
+
+def sample_volume(values: Float32, origin: Float64, voxel_size: Float64, points: Float64, normals: Float32) -> Float32:
+    """Irradiance [lx] as a client reconstructs it: trilinear, a quarter voxel off the surface, the basis along the normal.
+
+    Parameters
+    ----------
+    values : (6, ny, nz, nx, 3) float32 [lx], an ambient cube volume; origin : (3,) [m], centre of voxel (0, 0, 0); voxel_size : (3,) [m]
+    points : (n, 3) [m], world frame, on surfaces; normals : (n, 3) unit
+
+    Returns
+    -------
+    irradiance : (n, 3) float32 [lx]
+
+    Beyond the volume's outermost voxel centres its edge is read, as with a clamped texture.
+    """
+    faces = sample_coefficients(values, origin, voxel_size, points + 0.25 * voxel_size * normals)
+    return np.einsum("nb,nbc->nc", basis_weights(np.asarray(normals, np.float32)), faces)
+
+
+def sample_coefficients(values: Float32, origin: Float64, voxel_size: Float64, points: Float64) -> Float32:
+    """All coefficients (n, B, C) at points (n, 3) [m], trilinear and clamped to the edge. values is (B, ny, nz, nx, C)."""
+    ny, nz, nx = values.shape[1:4]
+    top = np.array([nx, ny, nz]) - 1
+    at = np.clip((points - origin) / voxel_size, 0, top)
+    low = np.minimum(at.astype(np.int64), np.maximum(top - 1, 0))
+    fraction = at - low
+    total = np.zeros((len(points), values.shape[0], values.shape[4]), np.float32)
+    texels = np.moveaxis(values, 0, 3)
+    for corner in range(8):
+        offset = np.array([corner & 1, corner >> 1 & 1, corner >> 2 & 1])
+        weight = np.where(offset, fraction, 1 - fraction).prod(axis=1)
+        x, y, z = np.minimum(low + offset, top).T
+        total += weight[:, None, None].astype(np.float32) * texels[y, z, x]
+    return total

@@ -1,0 +1,46 @@
+// Fills one sector's part of an irradiance volume (slide "Irradiance volume") from the probes that each voxel blends.
+//
+//   volume[b][y][z][x] = sum over the voxel's probes: voxel_weight * probe_cube[b]    [lx]
+//
+// Global size: (box x, box y, box z), one work-item per voxel of the box. Heights outside the sector's stored range read its lowest
+// or highest layer: above the roofs is open air.
+//
+// Defines: BASIS_SIZE, VOXEL_PROBES.
+#ifndef BASIS_SIZE
+#error "BASIS_SIZE is not defined"
+#endif
+#ifndef VOXEL_PROBES
+#error "VOXEL_PROBES is not defined"
+#endif
+
+#include "layout.h"
+
+__kernel void fill_volume(
+    __constant VolumeBox *box,
+    __global const ushort *voxel_probe,
+    __global const float *voxel_weight,
+    __global const float *probe_cube,
+    __global float *volume)
+{
+    const int x = get_global_id(0), y = get_global_id(1), z = get_global_id(2);
+    if (x >= box->box_size[0] || y >= box->box_size[1] || z >= box->box_size[2])
+        return;
+    const int sx = box->sector_first[0] + x, sz = box->sector_first[2] + z;
+    const int sy = clamp(box->sector_first[1] + y, 0, box->sector_size[1] - 1);
+    const uint voxel = ((uint)sy * box->sector_size[2] + sz) * box->sector_size[0] + sx;
+    float sum[BASIS_SIZE * 3];
+    for (int i = 0; i < BASIS_SIZE * 3; ++i)
+        sum[i] = 0.0f;
+    for (int k = 0; k < VOXEL_PROBES; ++k) {
+        const float weight = voxel_weight[voxel * VOXEL_PROBES + k];
+        __global const float *cube = probe_cube + (uint)voxel_probe[voxel * VOXEL_PROBES + k] * BASIS_SIZE * 3;
+        for (int i = 0; i < BASIS_SIZE * 3; ++i)
+            sum[i] += weight * cube[i];
+    }
+    const uint stride = (uint)box->volume_size[0] * box->volume_size[1] * box->volume_size[2] * 3;
+    const uint at = (((uint)(box->volume_first[1] + y) * box->volume_size[2] + box->volume_first[2] + z) * box->volume_size[0]
+                     + box->volume_first[0] + x) * 3;
+    for (int b = 0; b < BASIS_SIZE; ++b)
+        for (int c = 0; c < 3; ++c)
+            volume[b * stride + at + c] = sum[3 * b + c];
+}

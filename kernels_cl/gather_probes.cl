@@ -1,0 +1,40 @@
+// Pass 2 of a relight (slide "Relight probes": lighting from the sky, sum up brick and sky irradiance).
+//
+//   probe coefficient b = sum over the probe's factors: factor_weight[factor][b] * exitance[factor_source[factor]]    [lx]
+//
+// Sources are bricks, then sky patches, so one loop sums both. Writes all of probe_cube. One work-item per probe; sums run in the
+// order of the factor list: the same input gives the same bits.
+//
+// Defines: BASIS_SIZE, coefficients per channel (6: the ambient cube).
+#ifndef BASIS_SIZE
+#error "BASIS_SIZE is not defined"
+#endif
+
+__kernel void gather_probes(
+    const uint probes,
+    __global const uint *factor_starts,
+    __global const uint *factor_source,
+    __global const float *factor_weight,
+    __global const float4 *exitance,
+    __global float *probe_cube)
+{
+    const uint probe = get_global_id(0);
+    if (probe >= probes)
+        return;
+    float sum[BASIS_SIZE * 3];
+    for (int i = 0; i < BASIS_SIZE * 3; ++i)
+        sum[i] = 0.0f;
+    const uint end = factor_starts[probe + 1];
+    for (uint f = factor_starts[probe]; f < end; ++f) {
+        const float4 source = exitance[factor_source[f]];
+        __global const float *weight = factor_weight + f * BASIS_SIZE;
+        for (int b = 0; b < BASIS_SIZE; ++b) {
+            sum[3 * b] += weight[b] * source.x;
+            sum[3 * b + 1] += weight[b] * source.y;
+            sum[3 * b + 2] += weight[b] * source.z;
+        }
+    }
+    __global float *out = probe_cube + probe * BASIS_SIZE * 3;
+    for (int i = 0; i < BASIS_SIZE * 3; ++i)
+        out[i] = sum[i];
+}
