@@ -7,6 +7,7 @@ from typing import Any
 
 from gi_core.dataset import Dataset
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from gi_core.errors import InputError, SectorMissingError
@@ -73,7 +74,8 @@ def show_sector(path: Path, text: str) -> None:
 def _table(title: str, rows: Mapping[str, Any]) -> Table:
     table = Table("", "", title=title, title_justify="left", show_header=False)
     for name, value in _flat(rows):
-        table.add_row(name, f"{value:,}" if isinstance(value, int) and not isinstance(value, bool) else str(value))
+        # Names come from files: escaped, or rich would read their brackets as markup.
+        table.add_row(escape(name), f"{value:,}" if isinstance(value, int) and not isinstance(value, bool) else escape(str(value)))
     return table
 
 

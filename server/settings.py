@@ -16,14 +16,12 @@ class Settings:
     host, port : where to listen; beyond loopback only with a token file
     device : part of an OpenCL device's name, or None for the engine's choice
     token_file : file whose stripped text is the bearer token of writes
-    preview_max_pixels : the largest picture that may be asked for
     """
 
     host: str = "127.0.0.1"
     port: int = 8000
     device: str | None = None
     token_file: Path | None = None
-    preview_max_pixels: int = 1920 * 1080
 
     def checked(self) -> "Settings":
         """Itself, or InputError when a server must not start like this."""

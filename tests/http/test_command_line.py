@@ -77,7 +77,7 @@ def test_a_server_beyond_loopback_needs_a_token(sectorlight: RunCommand, city: P
 
 
 def test_an_unknown_device_lists_those_that_exist(sectorlight: RunCommand, city: Path) -> None:
-    expect_refusal(sectorlight("serve", str(city), "--port", "0", "--device", "abacus"), "abacus", "expected")
+    expect_refusal(sectorlight("serve", str(city), "--port", "0", "--device", "abacus"), "abacus", "there are")
 
 
 def test_a_taken_port_is_one_clear_line(sectorlight: RunCommand, city: Path) -> None:
