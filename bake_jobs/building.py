@@ -133,12 +133,14 @@ def _outside_colour(corners: Float64, wall: tuple[float, float, float]) -> Float
 
 
 def _painted_inside(mesh: Mesh, room: Room) -> Mesh:
-    """The mesh with the surfaces that bound a room in indoor colours."""
+    """The mesh with the surfaces that bound a room, from inside, in indoor colours."""
     corners = mesh.vertices[mesh.triangles]
-    middle = corners.mean(axis=1)
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    albedo = mesh.albedo.copy()
     tolerance = 1e-6  # m: rounding of coordinates within some kilometres of the origin
-    bounds = ((middle >= np.array(room.minimum) - tolerance) & (middle <= np.array(room.maximum) + tolerance)).all(axis=1)
-    level = np.ptp(corners[:, :, 1], axis=1) == 0
-    is_floor = middle[:, 1] < (room.minimum[1] + room.maximum[1]) / 2
-    inside = np.where(level[:, None], np.where(is_floor[:, None], FLOOR_ALBEDO, CEILING_ALBEDO), INNER_WALL_ALBEDO)
-    return Mesh(mesh.vertices, mesh.triangles, np.where(bounds[:, None], inside, mesh.albedo).astype(np.float32), mesh.emission)
+    for axis in range(3):
+        from_low = (np.abs(corners[:, :, axis] - room.minimum[axis]) < tolerance).all(axis=1) & (normal[:, axis] > 0)
+        from_high = (np.abs(corners[:, :, axis] - room.maximum[axis]) < tolerance).all(axis=1) & (normal[:, axis] < 0)
+        albedo[from_low] = FLOOR_ALBEDO if axis == 1 else INNER_WALL_ALBEDO
+        albedo[from_high] = CEILING_ALBEDO if axis == 1 else INNER_WALL_ALBEDO
+    return Mesh(mesh.vertices, mesh.triangles, albedo, mesh.emission)

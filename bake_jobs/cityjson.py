@@ -188,11 +188,12 @@ def _ground_in_gaps(mesh: Mesh, polygons: list[_Polygon], path: Path) -> Terrain
     used = mesh.vertices[np.unique(mesh.triangles)]
     if not np.isfinite(used).all():
         return None
-    low, high = used[:, [0, 2]].min(axis=0)[None], used[:, [0, 2]].max(axis=0)[None]
+    corners = mesh.vertices[mesh.triangles][:, :, [0, 2]]
+    low, high = corners.min(axis=1), corners.max(axis=1)
     if cells_needed(low, high) > MAX_CELLS:
         raise SourceError(f"{path}: expected one city, found {np.ptp(used, axis=0).max():.3g} m between the farthest vertices; split it")
     if not len(feet):
-        feet = np.array([[low[0, 0], used[:, 1].min(), low[0, 1]]])
+        feet = used[used[:, 1].argmin()][None]
     terrain = terrain_under(feet[:, [0, 2]], feet[:, 1] - GROUND_BELOW_M, low, high)
     gaps = _cells_with_gaps(mesh, terrain, float(used[:, 1].max()))
     return Terrain(terrain.first, terrain.height, gaps) if gaps.any() else None

@@ -138,22 +138,24 @@ def _component_bounds(vertices: Float64, triangles: Int64, component: Int64, cou
 def _closed_components(triangles: Int64) -> tuple[Int64, Bool]:
     """(m,) component of each triangle and (n,) whether it is closed.
 
-    Triangles connect where exactly two share an edge, in opposite senses; so solids that only touch stay apart.
+    Triangles connect where exactly two share an edge, in opposite senses; so solids that only touch stay apart. A component is
+    closed when it walks every edge as often one way as the other.
     """
     m = len(triangles)
     start, end = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
-    edge = np.minimum(start, end) * (int(triangles.max()) + 1) + np.maximum(start, end)
+    key = np.minimum(start, end) * (int(triangles.max()) + 1) + np.maximum(start, end)
+    edge = np.unique(key, return_inverse=True)[1]
     order = np.argsort(edge, kind="stable")
-    ordered = edge[order]
-    begins = np.flatnonzero(np.r_[True, ordered[1:] != ordered[:-1]])
-    pair = begins[np.diff(np.r_[begins, len(ordered)]) == 2]
+    first = np.r_[0, np.cumsum(np.bincount(edge))]
+    pair = first[:-1][np.diff(first) == 2]
     one, other = order[pair], order[pair + 1]
     opposite = start[one] != start[other]
-    one, other = one[opposite], other[opposite]
-    graph = coo_array((np.ones(len(one), np.int8), (one // 3, other // 3)), shape=(m, m))
+    one, other = one[opposite] // 3, other[opposite] // 3
+    graph = coo_array((np.ones(len(one), np.int8), (one, other)), shape=(m, m))
     count, component = connected_components(graph, directed=False)
-    matched = np.zeros(3 * m, bool)
-    matched[one] = matched[other] = True
-    open_triangle = ~matched.reshape(m, 3).all(axis=1)
-    closed = np.bincount(component[open_triangle], minlength=count) == 0
+    owner = np.repeat(component.astype(np.int64), 3)
+    edge_of_owner, slot = np.unique(edge * count + owner, return_inverse=True)
+    balance = np.bincount(slot, np.where(start < end, 1.0, -1.0))
+    closed = np.ones(count, bool)
+    closed[edge_of_owner[balance != 0] % count] = False
     return component.astype(np.int64), closed

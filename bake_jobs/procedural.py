@@ -108,7 +108,7 @@ def _buildings(block: Rectangle, name: str, random: np.random.Generator) -> Iter
         if random.random() < TOWER_SHARE:
             lots.append((Rectangle(x0, land.z0, x1, land.z1), ("z-", "z+", *avenues), True))
         else:
-            depth = (land.z1 - land.z0 - random.uniform(*REAR_YARD_M)) / 2
+            depth = round((land.z1 - land.z0 - float(random.uniform(*REAR_YARD_M))) / 2, 2)
             lots.append((Rectangle(x0, land.z0, x1, land.z0 + depth), ("z-", *avenues), False))
             lots.append((Rectangle(x0, land.z1 - depth, x1, land.z1), ("z+", *avenues), False))
     enterable = random.random(len(lots)) < ENTERABLE_SHARE

@@ -32,7 +32,7 @@ def load_scene(source: str | Path) -> Scene:
     if text.startswith(PROCEDURAL_PREFIX):
         content, name = load_procedural(text), text
     elif text.lower().endswith(".toml"):
-        content, name = load_world_file(_existing(text), load_content)
+        content, name = load_world_file(_existing(text), load_content), _stem(text)
     else:
         content, name = load_content(_existing(text), None), _stem(text)
     mesh, dropped = clean_mesh(content.mesh, text, content.rooms)

@@ -66,7 +66,7 @@ def terrain_under(position: Float64, base: Float64, low: Float64, high: Float64)
     origin = first_sector.min(axis=0) - 1
     shape = last_sector.max(axis=0) + 2 - origin
     touched = np.zeros(tuple(shape), bool)
-    for (x0, z0), (x1, z1) in zip((first_sector - origin).tolist(), (last_sector - origin).tolist(), strict=True):
+    for x0, z0, x1, z1 in np.unique(np.concatenate([first_sector - origin, last_sector - origin], axis=1), axis=0).tolist():
         touched[x0 - 1 : x1 + 2, z0 - 1 : z1 + 2] = True
     covered = np.repeat(np.repeat(touched, CELLS_PER_SECTOR, axis=0), CELLS_PER_SECTOR, axis=1)
     first = origin * CELLS_PER_SECTOR
