@@ -7,6 +7,7 @@ from datetime import UTC, datetime
 import ephem
 
 from gi_core.arrays import Float64
+from gi_core.errors import InputError
 from gi_core.world import Location, direction_from_azimuth
 
 STANDARD_PRESSURE_MBAR = 1010.0
@@ -88,9 +89,16 @@ def moon_position(
 
 def _observer(location: Location, time: datetime) -> ephem.Observer:
     """An observer without air. Made anew for each call: ephem's objects must not be shared between threads."""
+    latitude, longitude, height = location.latitude_degrees, location.longitude_degrees, location.elevation_m
+    # Written so that NaN is refused too.
+    if not (-90 <= latitude <= 90 and -360 <= longitude <= 360 and -1000 <= height <= 10_000):
+        raise InputError(
+            f"location: expected a latitude of -90..90 and a longitude of -360..360 degrees, and an elevation of -1000..10000 m, "
+            f"got {latitude!r}, {longitude!r}, {height!r}"
+        )
     observer = ephem.Observer()
-    observer.lat, observer.lon = math.radians(location.latitude_degrees), math.radians(location.longitude_degrees)
-    observer.elevation = location.elevation_m
+    observer.lat, observer.lon = math.radians(latitude), math.radians(longitude)
+    observer.elevation = height
     observer.pressure = 0.0
     observer.date = ephem.Date(time.astimezone(UTC).replace(tzinfo=None))
     return observer

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gi_core.errors import InputError
 from gi_core.sun import moon_position, refraction_degrees, sun_position
 from gi_core.world import Location
 
@@ -102,3 +103,10 @@ def test_threads_do_not_disturb_each_other() -> None:
     alone = [sun_position(place(40.0), moment) for moment in moments]
     with ThreadPoolExecutor(4) as pool:
         assert list(pool.map(lambda moment: sun_position(place(40.0), moment), moments)) == alone
+
+
+@pytest.mark.parametrize("where", [(91.0, 0.0, 0.0), (float("nan"), 0.0, 0.0), (0.0, float("inf"), 0.0), (0.0, 0.0, 1e9)])
+def test_an_impossible_place_is_an_input_error(where: tuple[float, float, float]) -> None:
+    latitude, longitude, height = where
+    with pytest.raises(InputError, match="location: expected a latitude"):
+        sun_position(Location(latitude, longitude, height, "UTC"), day(2024, 1, 1))

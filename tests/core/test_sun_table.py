@@ -2,7 +2,7 @@
 
 import json
 import math
-from datetime import date
+from datetime import UTC, date, datetime
 
 import numpy as np
 import pytest
@@ -10,6 +10,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from gi_core.errors import CorruptFileError, InputError
+from gi_core.sun import sun_position
 from gi_core.sun_table import DECLINATION_LIMIT_DEGREES, SunTable
 from gi_core.world import Location, direction_from_azimuth
 
@@ -102,6 +103,17 @@ def test_any_direction_gets_weights_that_sum_to_one(latitude: float, north: floa
     assert ((planes >= 0) & (planes < table.plane_count)).all()
     assert (weights >= 0).all()
     assert weights.sum() == pytest.approx(1, abs=1e-6)
+
+
+@pytest.mark.parametrize("latitude", [0.0, 40.7, 70.0, 90.0, -35.0])
+def test_the_real_sun_of_a_solstice_noon_reads_the_node_of_a_solstice_noon(latitude: float) -> None:
+    place = Location(latitude, 0.0, 0.0, "UTC", 29.0, date(2024, 6, 21))
+    # The sun crosses Greenwich's meridian 2 minutes after 12:00 that day.
+    position = sun_position(place, datetime(2024, 6, 20, 12, 2, tzinfo=UTC), 0.0)
+    table = SunTable.build(place)
+    planes, weights = table.lookup(position.direction(29.0))
+    assert weights.max() > 0.97
+    assert planes[np.argmax(weights)] == table.plane_of_node[-1, 0]
 
 
 def test_turning_the_world_turns_the_table() -> None:
