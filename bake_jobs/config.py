@@ -21,6 +21,8 @@ class BakeSettings:
     wall_doubling_m [m] : above this height over the scene's lowest point, the upward spacing doubles at every step
     wall_offset_m [m] : wall probes stand this far off their wall
     margin_m [m] : probes are also placed this far beyond the sector's border, by the same rule, so that no seam shows
+    cells_double_beyond_m [m] : surfel and brick cells double with every doubling of the closest probe's distance beyond this; more:
+        more surfels. The slides give 1 m and 4 m, and no word on the distance; their 49 surfels a probe are out of reach without it
     sun_declination_step_degrees, sun_hour_step_degrees : spacing of the baked sun directions; less: sharper shadows, larger files
     voxel_probes : probes that a voxel blends at most
     voxel_candidates : nearest probes that are tested for visibility from a voxel
@@ -35,11 +37,12 @@ class BakeSettings:
     probe_height_m: float = 1.5
     head_room_m: float = 2.0
     wall_spacing_m: float = 8.0
-    wall_doubling_m: float = 32.0
+    wall_doubling_m: float = 12.0
     wall_offset_m: float = 1.0
     margin_m: float = 4.0
-    sun_declination_step_degrees: float = 9.5
-    sun_hour_step_degrees: float = 10.0
+    cells_double_beyond_m: float = 8.0
+    sun_declination_step_degrees: float = 12.0
+    sun_hour_step_degrees: float = 12.0
     voxel_probes: int = 4
     voxel_candidates: int = 8
     feedback_probes: int = 1

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from bake_jobs.config import BakeSettings
-from bake_jobs.gbuffer import inside_solid
+from bake_jobs.inside import inside_solid
 from bake_jobs.rays import SURFACE_OFFSET_M, RayScene
 from bake_jobs.scene import ProbeHint
 from gi_core.arrays import Bool, Float64, UInt8, UInt16

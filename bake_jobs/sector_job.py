@@ -54,7 +54,7 @@ class SectorBaker:
         scene, settings, rays = self._scene, self._settings, self._rays
         placed = placement.place_probes(rays, scene.bounds, index, settings, scene.rooms, scene.hints)
         seen = gbuffer.render(rays, placed.position, self._pattern)
-        clustered = surfels.cluster(seen, index.origin, scene.albedo, scene.emission)
+        clustered = surfels.cluster(seen, index.origin, scene.albedo, scene.emission, settings.cells_double_beyond_m)
         weights = factors.gather(seen, self._pattern, clustered)
         feedback_probe, feedback_weight = surfels.feedback(clustered, seen, settings.feedback_probes)
         heights = geometry.vertices[:, 1] if len(geometry.vertices) else np.zeros(1)
@@ -69,6 +69,7 @@ class SectorBaker:
             factor_source=weights.source,
             factor_weight=weights.weight,
             brick_starts=clustered.brick_starts.astype(np.uint32),
+            brick_level=clustered.brick_level,
             brick_cell=clustered.brick_cell,
             brick_direction=clustered.brick_direction,
             surfel_position=clustered.position.astype(np.float32),

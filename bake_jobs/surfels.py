@@ -1,10 +1,14 @@
 """Clusters what probes see into surfels and bricks (slides "Surfel sharing", "Surfel grid"): a two-level hash grid.
 
-A hit's key names its 4 m brick cell, its principal normal direction, and its 1 m cell inside the brick, in that order of
-significance. Sorting by the key therefore sorts surfels by brick, and a brick is a run of surfels:
+A hit's key names its brick's cell, its principal normal direction, and its own cell inside the brick, in that order of significance.
+Sorting by the key therefore sorts surfels by brick, and a brick is a run of surfels:
 
-    key = [brick y | brick z | brick x | direction | cell in brick]
-            16 bit    16 bit    16 bit    3 bit        6 bit
+    key = [level | brick y | brick z | brick x | direction | cell in brick]
+           3 bit    16 bit    16 bit    16 bit     3 bit        6 bit
+
+Cells are 1 m and bricks 4 m wide at level 0, and twice as wide at each next level. A 1 m cell goes to the level that the distance of
+the closest probe which sees it asks for: beyond some 10 m, the rays of a 16 x 16 face fall further apart than 1 m, and every hit
+would become a surfel of its own.
 """
 
 from dataclasses import dataclass
@@ -13,7 +17,7 @@ import numpy as np
 
 from bake_jobs.gbuffer import GBuffer
 from gi_core.arrays import Float32, Float64, Int32, Int64, UInt8, UInt16
-from gi_core.constants import BRICK_CELL_M, SURFEL_CELL_M
+from gi_core.constants import BRICK_CELL_M, MAX_BRICK_LEVEL, SURFEL_CELL_M
 from gi_core.errors import SourceError
 
 CELLS_PER_BRICK = round(BRICK_CELL_M / SURFEL_CELL_M)
@@ -35,6 +39,7 @@ class Surfels:
     albedo: Float32
     emission: Float32
     brick_starts: Int64
+    brick_level: UInt8
     brick_cell: Int32
     brick_direction: UInt8
     of_hit: Int64
@@ -57,22 +62,31 @@ def principal_direction(normal: Float32) -> UInt8:
     return (2 * axis + negative).astype(np.uint8)
 
 
-def cluster(gbuffer: GBuffer, origin: Float64, albedo: Float32, emission: Float32) -> Surfels:
-    """Group a sector's hits into surfels and bricks. ``origin`` (3,) is the sector's; albedo and emission (m, 3) are the triangles'."""
+def cluster(gbuffer: GBuffer, origin: Float64, albedo: Float32, emission: Float32, double_beyond_m: float) -> Surfels:
+    """Group a sector's hits into surfels and bricks.
+
+    origin : (3,) the sector's; albedo, emission : (m, 3) of the scene's triangles
+    double_beyond_m : cells are 1 m where some probe is closer than this, and double with every doubling of that distance
+    """
     hit = np.flatnonzero(gbuffer.hits.hit)
     local = gbuffer.position[hit] - origin
     normal = gbuffer.hits.normal[hit]
     direction = principal_direction(normal)
     cell = np.floor((local + normal * KEY_OFFSET_M) / SURFEL_CELL_M).astype(np.int64)
-    brick = cell // CELLS_PER_BRICK
-    if len(brick) and np.abs(brick).max() >= _HALF_RANGE:
+    if len(cell) and np.abs(cell).max() >= _HALF_RANGE * CELLS_PER_BRICK:
         raise SourceError(f"a probe sees a surface more than {_HALF_RANGE * BRICK_CELL_M:.0f} m away; split the world into parts")
-    within = cell - brick * CELLS_PER_BRICK
-    b = brick + _HALF_RANGE
-    key = (b[:, 1] << 16 | b[:, 2]) << 16 | b[:, 0]
-    key = (key << 3 | direction) << 6 | (within[:, 1] << 4 | within[:, 2] << 2 | within[:, 0])
-    surfel_key, of_hit, hits_of_surfel = np.unique(key, return_inverse=True, return_counts=True)
+    fine_key, fine_of_hit = np.unique(_key(cell, direction, np.zeros(len(cell), np.int64)), return_inverse=True)
+    fine_of_hit = fine_of_hit.reshape(-1)
+    closest = np.full(len(fine_key), np.inf, np.float32)
+    np.minimum.at(closest, fine_of_hit, gbuffer.hits.distance[hit])
+    level = np.clip(np.floor(np.log2(np.maximum(closest, 1e-6) / double_beyond_m)) + 1, 0, MAX_BRICK_LEVEL).astype(np.int64)
+    of_fine_cell = np.empty(len(fine_key), np.int64)
+    of_fine_cell[fine_of_hit] = np.arange(len(hit))  # any hit of a fine cell knows its place and direction
+    coarse_cell = cell[of_fine_cell] >> level[:, None]
+    surfel_key, surfel_of_fine = np.unique(_key(coarse_cell, direction[of_fine_cell], level), return_inverse=True)
+    of_hit = surfel_of_fine.reshape(-1)[fine_of_hit]
     count = len(surfel_key)
+    hits_of_surfel = np.bincount(of_hit, minlength=count)
 
     def mean(values: Float64 | Float32) -> Float64:
         columns = [np.bincount(of_hit, values[:, c], count) for c in range(3)]
@@ -89,11 +103,21 @@ def cluster(gbuffer: GBuffer, origin: Float64, albedo: Float32, emission: Float3
         albedo=mean(albedo[triangle]).astype(np.float32),
         emission=mean(emission[triangle]).astype(np.float32) if emission.any() else np.zeros((count, 3), np.float32),
         brick_starts=np.append(first, count).astype(np.int64),
+        brick_level=(brick_key >> 51).astype(np.uint8),
         brick_cell=brick_cell.astype(np.int32),
         brick_direction=(brick_key & 7).astype(np.uint8),
-        of_hit=of_hit.reshape(-1),
+        of_hit=of_hit,
         hit=hit,
     )
+
+
+def _key(cell: Int64, direction: UInt8, level: Int64) -> Int64:
+    """Sort keys (n,) of surfel cells (n, 3) at their level's size; the module's docstring draws the bits."""
+    brick = cell // CELLS_PER_BRICK
+    within = cell - brick * CELLS_PER_BRICK
+    b = brick + _HALF_RANGE
+    key = ((level << 16 | b[:, 1]) << 16 | b[:, 2]) << 16 | b[:, 0]
+    return (key << 3 | direction) << 6 | (within[:, 1] << 4 | within[:, 2] << 2 | within[:, 0])
 
 
 def feedback(surfels: Surfels, gbuffer: GBuffer, k: int) -> tuple[UInt16, Float32]:

@@ -11,7 +11,7 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
 from bake_jobs.config import BakeSettings
-from bake_jobs.gbuffer import inside_solid
+from bake_jobs.inside import inside_solid
 from bake_jobs.placement import Placement, room_of
 from bake_jobs.rays import SURFACE_OFFSET_M, RayScene
 from gi_core.arrays import Float32, Float64, Int32, Int64, UInt8, UInt16

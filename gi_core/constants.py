@@ -8,6 +8,7 @@ SKY_SHAPE = (64, 128)  # (contract) rows (polar angle from +Y), columns (from +X
 
 SURFEL_CELL_M = 1.0  # slide "Surfel grid"
 BRICK_CELL_M = 4.0  # slide "Surfel grid"
+MAX_BRICK_LEVEL = 7  # cells double at most this often: bricks of 512 m
 
 # No surface outdoors reflects more than fresh snow does, and the feedback loop must contract: each bounce loses at least 5 %.
 ALBEDO_MAX = 0.95

@@ -19,7 +19,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from gi_core.arrays import AnyArray, Float32, Int32, Int64, UInt8, UInt16, UInt32
-from gi_core.constants import MAX_PROBES_PER_SECTOR
+from gi_core.constants import MAX_BRICK_LEVEL, MAX_PROBES_PER_SECTOR
 from gi_core.errors import CorruptFileError
 from gi_core.grid import SectorIndex
 
@@ -37,7 +37,8 @@ class Sector:
     factor_source : (F,) uint32, < N a brick, otherwise sky patch source - N
     factor_weight : (F, B) float32, form factors
     brick_starts : (N + 1,) uint32; no brick is empty
-    brick_cell : (N, 3) int32, cell of BRICK_CELL_M in sector-local space
+    brick_level : (N,) uint8; a brick's cell is BRICK_CELL_M * 2 ** level wide, its surfels' cells SURFEL_CELL_M * 2 ** level
+    brick_cell : (N, 3) int32, which cell of that size in sector-local space
     brick_direction : (N,) uint8, principal normal direction of its surfels, an ambient cube face
     surfel_position : (S, 3) float32 [m], sector-local
     surfel_normal : (S, 3) float32, unit, towards the side that probes see
@@ -63,6 +64,7 @@ class Sector:
     factor_source: UInt32
     factor_weight: Float32
     brick_starts: UInt32
+    brick_level: UInt8
     brick_cell: Int32
     brick_direction: UInt8
     surfel_position: Float32
@@ -163,6 +165,8 @@ def check_sector(sector: Sector, sky_patches: int) -> None:
     else:
         expect(not s.feedback_weight.any() and not s.voxel_weight.any(), "no weights in a sector without probes")
     expect(s.brick_direction.max(initial=0) < 6, "brick directions below 6")
+    expect(len(s.brick_level) == s.brick_count, f"levels for {s.brick_count} bricks, got {len(s.brick_level)}")
+    expect(s.brick_level.max(initial=0) <= MAX_BRICK_LEVEL, f"brick levels up to {MAX_BRICK_LEVEL}")
     expect(s.voxel_class.max(initial=0) <= 2, "voxel classes 0..2")
     for field in fields(s):
         values = getattr(s, field.name)

@@ -17,7 +17,7 @@ from gi_core.sector import Sector, check_sector, counts, starts
 KIND = "SECT"
 VERSION = 1
 NO_PROBE = 0xFFFF
-# A cell's 4 m are divided into 256 steps of 1.6 cm.
+# A brick's cell is divided into 256 steps: 1.6 cm of 4 m.
 _CELL_STEPS = 256
 
 
@@ -25,8 +25,8 @@ def encode(sector: Sector, meta: dict[str, Any], sky_patches: int) -> bytes:
     """Bytes of a sector file. ``meta`` is any JSON object: the baker's fingerprint, counts and report."""
     s = sector
     weight_codes, weight_scales = _encode_weights(s)
-    cell_of_surfel = np.repeat(s.brick_cell, counts(s.brick_starts), axis=0)
-    in_cell = np.floor((s.surfel_position.astype(np.float64) / BRICK_CELL_M - cell_of_surfel) * _CELL_STEPS)
+    cell, size = _surfel_cells(s.brick_cell, s.brick_level, s.brick_starts)
+    in_cell = np.floor((s.surfel_position / size - cell) * _CELL_STEPS)
     feedback = np.where(s.feedback_weight > 0, s.feedback_probe, NO_PROBE).astype(np.uint16)
     arrays: dict[str, AnyArray] = {
         "probe_position": quantise.encode_length(s.probe_position).T,
@@ -37,6 +37,7 @@ def encode(sector: Sector, meta: dict[str, Any], sky_patches: int) -> bytes:
         "factor_weight": weight_codes,
         "factor_scale": weight_scales,
         "brick_count": counts(s.brick_starts).astype(np.uint16),
+        "brick_level": s.brick_level,
         "brick_cell": s.brick_cell.T.astype(np.int32),
         "brick_direction": s.brick_direction,
         "surfel_in_cell": np.clip(in_cell, 0, _CELL_STEPS - 1).astype(np.uint8).T,
@@ -96,6 +97,12 @@ def same_arrays(a: Sector, b: Sector) -> bool:
     return a.index == b.index
 
 
+def _surfel_cells(brick_cell: AnyArray, brick_level: AnyArray, brick_starts: AnyArray) -> tuple[AnyArray, AnyArray]:
+    """The cell (S, 3) of each surfel's brick, and its size (S, 1) [m]."""
+    of_surfel = np.repeat(np.arange(len(brick_cell)), counts(brick_starts))
+    return brick_cell[of_surfel], BRICK_CELL_M * 2.0 ** brick_level[of_surfel, None]
+
+
 def _is_sky(s: Sector) -> AnyArray:
     return s.factor_source >= s.brick_count
 
@@ -141,8 +148,9 @@ def _sector(found: Container) -> Sector:
     # A wrong count would otherwise size the arrays that np.repeat makes.
     if int(factor_starts[-1]) != len(source) or int(brick_starts[-1]) != len(in_cell) or len(brick_cell) != len(brick_starts) - 1:
         raise CorruptFileError("counts per probe or brick do not add up")
-    cell_of_surfel = np.repeat(brick_cell, counts(brick_starts), axis=0)
-    position = (cell_of_surfel + (in_cell.astype(np.float64) + 0.5) / _CELL_STEPS) * BRICK_CELL_M
+    brick_level = take("brick_level", "u1", 1)
+    cell, size = _surfel_cells(brick_cell, brick_level, brick_starts)
+    position = (cell + (in_cell.astype(np.float64) + 0.5) / _CELL_STEPS) * size
     feedback = take("feedback_probe", "u2", 2).T
     lit = feedback != NO_PROBE
     if feedback.shape[1] > 1:
@@ -165,6 +173,7 @@ def _sector(found: Container) -> Sector:
             take("factor_weight", "u1", 2), take("factor_scale", "f2", 3), factor_starts, source >= len(brick_cell)
         ),
         brick_starts=brick_starts,
+        brick_level=brick_level,
         brick_cell=brick_cell,
         brick_direction=take("brick_direction", "u1", 1),
         surfel_position=np.ascontiguousarray(position, np.float32),
