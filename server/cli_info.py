@@ -5,11 +5,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from gi_core.dataset import Dataset
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from gi_core.dataset import Dataset
 from gi_core.errors import InputError, SectorMissingError
 from gi_core.grid import SectorIndex
 

@@ -66,7 +66,8 @@ def _own_error(request: Request, error: Exception) -> JSONResponse:
     if status >= 500:
         log.error("%s: %s", request.url.path, error)
     # FileNotFoundError and LookupError quote their argument in str(): the text itself is args[0].
-    return problem(status, error.code, str(error.args[0]) if error.args else error.code)
+    text = str(error.args[0]) if error.args else error.code
+    return problem(status, error.code, text if status < 500 else request.app.state.service.public(text))
 
 
 def _range_error(_: Request, error: Exception) -> JSONResponse:

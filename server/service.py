@@ -55,6 +55,10 @@ class Service:
         self._misfits = misfits(self.dataset, self._misfits)
         return self._misfits | self.engine.failed_sectors
 
+    def public(self, text: str) -> str:
+        """A message about a file without the folder that the dataset lies in, which is the operator's own."""
+        return text.replace(f"{self.dataset.path}/", "")
+
 
 def misfits(dataset: Dataset, sectors: Iterable[SectorIndex]) -> dict[SectorIndex, str]:
     """Which of ``sectors`` have a file that is missing or not as long as the index says, and why. Looks at no contents, so it is quick."""

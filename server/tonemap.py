@@ -9,11 +9,13 @@ from gi_core.arrays import AnyArray, Float32, UInt8
 
 # Saturation-based ISO speed (ISO 12232): the luminance that EV100 exposes to white is 1.2 x 2^EV100.
 WHITE_PER_EV = 1.2
+# One stop over the meter: indirect light is looked at in the shade, and the shoulder keeps what the sun hits.
+BRIGHTENING = 2.0
 
 
 def exposed(radiance: Float32, ev100: float) -> Float32:
-    """Radiance [cd m^-2] relative to the white of an exposure."""
-    return np.asarray(radiance * np.float32(1.0 / (WHITE_PER_EV * 2.0**ev100)), np.float32)
+    """Radiance [cd m^-2] relative to white, one stop brighter than the meter's."""
+    return np.asarray(radiance * np.float32(BRIGHTENING / (WHITE_PER_EV * 2.0**ev100)), np.float32)
 
 
 def filmic(linear: Float32) -> Float32:

@@ -19,7 +19,7 @@ async def healthz(_: Annotated[NoQuery, Query()]) -> HealthReply:
 @router.get("/readyz")
 async def readyz(service: ServiceDep, _: Annotated[NoQuery, Query()]) -> ReadyReply:
     """Queries are answered. Sectors whose files were refused are named; all others keep working."""
-    refused = [RefusedSector(sector=(i.x, i.z), reason=why) for i, why in sorted(service.failed_sectors.items())]
+    refused = [RefusedSector(sector=(i.x, i.z), reason=service.public(why)) for i, why in sorted(service.failed_sectors.items())]
     return ReadyReply(
         status="degraded" if refused else "ready",
         device=service.engine.device_name,
