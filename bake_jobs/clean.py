@@ -1,21 +1,24 @@
 """Make a source's triangles safe to bake: nothing non-finite, degenerate, doubled or inside-out. Never fatal while anything is left."""
 
+from collections.abc import Iterator
+
 import numpy as np
+import shapely
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from bake_jobs.scene import DroppedTriangles, Mesh, Scene
-from gi_core.arrays import Bool, Float64, Int64
+from bake_jobs.scene import DroppedTriangles, Mesh
+from gi_core.arrays import Bool, Float32, Float64, Int64
 from gi_core.constants import ALBEDO_MAX
 from gi_core.errors import SourceError
-from gi_core.world import Location, Room
+from gi_core.world import Room
 
 MAX_TRIANGLES = 50_000_000  # about 5 GB of scene; a city is a few million
 MAX_EXTENT_M = 1e6  # wider than this is a wrong unit or a stray vertex, not a city
 # A triangle whose doubled area is below this share of its longest edge squared is a line: its normal is rounding noise.
 DEGENERATE_RATIO = 1e-10
-# Nested shells are looked for among this many inside-out ones at a time, to bound memory.
-NESTING_CHUNK = 256
+# Nested shells are looked for around this many inside-out ones at a time, to bound memory.
+NESTING_CHUNK = 4096
 
 
 def clean_mesh(mesh: Mesh, where: str, rooms: tuple[Room, ...] = ()) -> tuple[Mesh, DroppedTriangles]:
@@ -26,13 +29,12 @@ def clean_mesh(mesh: Mesh, where: str, rooms: tuple[Room, ...] = ()) -> tuple[Me
     Raises SourceError, naming ``where``, when nothing is left, or what is left is too large to be a city.
     """
     _refuse_too_many(len(mesh.triangles), where)
-    in_range = ((mesh.triangles >= 0) & (mesh.triangles < len(mesh.vertices))).all(axis=1)
+    in_range: Bool = np.all((mesh.triangles >= 0) & (mesh.triangles < len(mesh.vertices)), axis=1)
     safe = np.where(in_range[:, None], mesh.triangles, 0) if len(mesh.vertices) else mesh.triangles[:0]
     if not len(safe):
         raise SourceError(f"{where}: expected triangles, found none; check that the file holds a mesh of surfaces")
-    finite_vertex = np.isfinite(mesh.vertices).all(axis=1)
-    finite = finite_vertex[safe].all(axis=1) & np.isfinite(mesh.albedo).all(axis=1) & np.isfinite(mesh.emission).all(axis=1)
-    finite |= ~in_range
+    finite_vertex = _finite_rows(mesh.vertices)
+    finite = np.all(finite_vertex[safe], axis=1) & _finite_rows(mesh.albedo) & _finite_rows(mesh.emission) | ~in_range
     vertices = np.where(finite_vertex[:, None], mesh.vertices, 0.0) + 0.0  # + 0.0 turns -0.0 into 0.0, its equal in all but bits
     flat = ~in_range | _without_area(vertices, safe)
     kept = np.flatnonzero(finite & ~flat)
@@ -52,9 +54,8 @@ def clean_mesh(mesh: Mesh, where: str, rooms: tuple[Room, ...] = ()) -> tuple[Me
     return Mesh(used, triangles, albedo, np.maximum(mesh.emission[kept], 0).astype(np.float32)), dropped
 
 
-def scene_of(mesh: Mesh, dropped: DroppedTriangles, name: str, location: Location) -> Scene:
-    """A scene of a cleaned mesh."""
-    return Scene(mesh.vertices, mesh.triangles.astype(np.int32), mesh.albedo, mesh.emission, name, location, dropped=dropped)
+def _finite_rows(values: Float64 | Float32) -> Bool:
+    return np.asarray(np.all(np.isfinite(values), axis=1), np.bool_)
 
 
 def _refuse_too_many(count: int, where: str) -> None:
@@ -115,16 +116,28 @@ def _inside_out(vertices: Float64, triangles: Int64, rooms: tuple[Room, ...]) ->
     if not len(candidates):
         return np.zeros(len(triangles), bool)
     low, high = _component_bounds(vertices, triangles, component, count)
-    room_middle = np.array([(np.array(room.minimum) + np.array(room.maximum)) / 2 for room in rooms]).reshape(-1, 3)
     flip = np.zeros(count, bool)
+    flip[candidates] = True
+    around_all = np.all((low <= low.min(axis=0)) & (high >= high.max(axis=0)), axis=1)
+    flip[around_all] = False
+    tree = shapely.STRtree(shapely.box(low[:, 0], low[:, 2], high[:, 0], high[:, 2]))
+    for inner, outer in _touching_pairs(tree, low, high, candidates):
+        nested = np.all((low[outer] < low[inner]) & (high[outer] > high[inner]), axis=1)
+        flip[outer[nested]] = False
+        flip[inner[nested & closed[outer]]] = False
+    for room in rooms:
+        middle = (np.array(room.minimum) + np.array(room.maximum)) / 2
+        flip[np.all((low < middle) & (high > middle), axis=1)] = False
+    return np.asarray(flip[component], np.bool_)
+
+
+def _touching_pairs(tree: shapely.STRtree, low: Float64, high: Float64, candidates: Int64) -> Iterator[tuple[Int64, Int64]]:
+    """Pairs (a, b) of components whose bounds touch in plan, each with a candidate as one of the two, both ways round."""
     for start in range(0, len(candidates), NESTING_CHUNK):
         some = candidates[start : start + NESTING_CHUNK]
-        inside_closed = ((low[some, None] > low[closed]) & (high[some, None] < high[closed])).all(axis=2).any(axis=1)
-        contains = ((low[some, None] < low) & (high[some, None] > high)).all(axis=2).any(axis=1)
-        has_room = ((low[some, None] < room_middle) & (high[some, None] > room_middle)).all(axis=2).any(axis=1)
-        around_all = (low[some] <= low.min(axis=0)).all(axis=1) & (high[some] >= high.max(axis=0)).all(axis=1)
-        flip[some] = ~(inside_closed | contains | has_room | around_all)
-    return np.asarray(flip[component], np.bool_)
+        index, other = tree.query(shapely.box(low[some, 0], low[some, 2], high[some, 0], high[some, 2]))
+        yield some[index], other
+        yield other, some[index]
 
 
 def _component_bounds(vertices: Float64, triangles: Int64, component: Int64, count: int) -> tuple[Float64, Float64]:

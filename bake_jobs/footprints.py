@@ -124,7 +124,8 @@ def _polygons(geometry: Any, where: str) -> Iterator[tuple[Float64, ...]]:
             for member in geometry.get("geometries", []):
                 yield from _polygons(member, where)
         elif kind in ("Polygon", "MultiPolygon"):
-            for polygon in [coordinates] if kind == "Polygon" else coordinates:
+            polygons: list[Any] = [coordinates] if kind == "Polygon" else list(coordinates or ())
+            for polygon in polygons:
                 rings = [np.array([point[:2] for point in ring], np.float64) for ring in polygon]
                 if rings and len(rings[0]) >= 3:
                     yield tuple(ring.reshape(-1, 2) for ring in rings if len(ring) >= 3)

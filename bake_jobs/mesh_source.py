@@ -111,8 +111,8 @@ def _placed(mesh: Any, to_world: AnyArray, suffix: str, materials: list[dict[str
 def _look(mesh: Any, triangles: Int64, suffix: str, materials: list[dict[str, Any]]) -> tuple[Float32, Float32]:
     """Albedo (m, 3), linear sRGB, and emission (m, 3) [cd m^-2]."""
     visual = mesh.visual
-    albedo = np.full((len(triangles), 3), DEFAULT_ALBEDO, np.float32)
-    emission = np.zeros((len(triangles), 3), np.float32)
+    albedo: Float32 = np.full((len(triangles), 3), DEFAULT_ALBEDO, np.float32)
+    emission: Float32 = np.zeros((len(triangles), 3), np.float32)
     if visual.kind == "texture":
         if suffix in (".glb", ".gltf"):
             return _gltf_look(visual, materials[int(visual.material.name)], triangles)
@@ -131,7 +131,7 @@ def _look(mesh: Any, triangles: Int64, suffix: str, materials: list[dict[str, An
         colour = np.asarray(visual.vertex_colors if per_vertex else visual.face_colors)[:, :3].astype(np.uint8)
         # glTF's vertex colours are linear; those in PLY and OBJ files come from cameras and painters, so sRGB.
         linear = colour.astype(np.float32) / 255 if suffix in (".glb", ".gltf") else linear_from_srgb(colour)
-        albedo = linear[triangles].mean(axis=1, dtype=np.float32) if per_vertex else linear
+        albedo = np.asarray(linear[triangles].mean(axis=1) if per_vertex else linear, np.float32)
     return albedo, emission
 
 

@@ -123,7 +123,11 @@ def scene_digest(scene: Scene) -> str:
     ):
         h.update(repr(values.shape).encode())
         h.update(np.ascontiguousarray(values, dtype).tobytes())
-    said = [dataclasses.asdict(item) for item in (scene.location, *scene.rooms, *scene.lamps, *scene.hints)]
-    counts = [len(scene.rooms), len(scene.lamps), len(scene.hints)]
-    h.update(json.dumps([counts, said], sort_keys=True, default=str).encode())
+    said = [
+        dataclasses.asdict(scene.location),
+        [dataclasses.asdict(room) for room in scene.rooms],
+        [dataclasses.asdict(lamp) for lamp in scene.lamps],
+        [dataclasses.asdict(hint) for hint in scene.hints],
+    ]
+    h.update(json.dumps(said, sort_keys=True, default=str).encode())
     return h.hexdigest()

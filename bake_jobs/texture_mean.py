@@ -29,13 +29,14 @@ def mean_over_triangles(image: UInt8, uv: Float64, triangles: Int64) -> Float32:
     corner = np.nan_to_num(uv, posinf=0, neginf=0)[triangles]
     edge, other = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
     texels = np.abs(edge[:, 0] * other[:, 1] - edge[:, 1] * other[:, 0]) / 2 * image.shape[0] * image.shape[1]
-    mips = _mip_chain(image)
+    halves = _mip_chain(image)
     level = np.floor(np.log2(np.maximum(texels / SAMPLES_PER_SIDE**2, 1)) / 2).astype(np.int64)
-    level = np.minimum(level, len(mips) - 1)
+    level = np.minimum(level, len(halves))
     weights = _sample_weights()
     colour = np.empty((len(triangles), 3), np.float32)
-    for number, mip in enumerate(mips):
+    for number in range(len(halves) + 1):
         here = np.flatnonzero(level == number)
+        mip: UInt8 | Float32 = halves[number - 1] if number else image
         for start in range(0, len(here), TRIANGLES_AT_ONCE):
             some = here[start : start + TRIANGLES_AT_ONCE]
             at = np.einsum("sk,tkc->tsc", weights, corner[some])
@@ -43,7 +44,7 @@ def mean_over_triangles(image: UInt8, uv: Float64, triangles: Int64) -> Float32:
             row = np.minimum((at[..., 1] * mip.shape[0]).astype(np.int64), mip.shape[0] - 1)
             column = np.minimum((at[..., 0] * mip.shape[1]).astype(np.int64), mip.shape[1] - 1)
             texel = mip[row, column]
-            colour[some] = (linear_from_srgb(texel) if texel.dtype == np.uint8 else texel).mean(axis=1)
+            colour[some] = (texel if number else linear_from_srgb(texel.astype(np.uint8))).mean(axis=1)
     return colour
 
 
@@ -59,16 +60,18 @@ def _sample_weights() -> Float64:
     return np.stack([1 - a - b, a, b], axis=1)
 
 
-def _mip_chain(image: UInt8) -> list[UInt8 | Float32]:
-    """The image as it is, then linear halves of it down to one texel. Averages are of light, so they are taken after decoding."""
-    chain: list[UInt8 | Float32] = [image]
-    while max(chain[-1].shape[:2]) > 1:
-        finer = chain[-1]
-        odd_rows, odd_columns = finer.shape[0] % 2, finer.shape[1] % 2
-        finer = np.pad(finer, ((0, odd_rows), (0, odd_columns), (0, 0)), mode="edge")
-        quarters = [finer[i::2, j::2] for i in (0, 1) for j in (0, 1)]
-        linear = [linear_from_srgb(quarter) if quarter.dtype == np.uint8 else quarter for quarter in quarters]
-        chain.append((linear[0] + linear[1] + linear[2] + linear[3]) / np.float32(4))
+def _mip_chain(image: UInt8) -> list[Float32]:
+    """Linear halves of an image, down to one texel. Averages are of light, so they are taken after decoding."""
+    chain: list[Float32] = []
+    finer: UInt8 | Float32 = image
+    while max(finer.shape[:2]) > 1:
+        even = np.pad(finer, ((0, finer.shape[0] % 2), (0, finer.shape[1] % 2), (0, 0)), mode="edge")
+        half = np.zeros((even.shape[0] // 2, even.shape[1] // 2, 3), np.float32)
+        for quarter in (even[i::2, j::2] for i in (0, 1) for j in (0, 1)):
+            half += quarter if chain else linear_from_srgb(quarter.astype(np.uint8))
+        half /= 4
+        chain.append(half)
+        finer = half
     return chain
 
 
