@@ -39,6 +39,7 @@ def disc_share(elevation_degrees: Float64) -> Float64:
     """
     x = np.clip(elevation_degrees / DISC_RADIUS_DEGREES - 1, -1, 1)
     share = 0.5 + (np.arcsin(x) + x * np.sqrt(1 - x * x)) / np.pi
+    # Exactly 0, whatever the last bit of the arc sine is.
     return np.where(np.asarray(elevation_degrees) <= 0, 0.0, share)
 
 

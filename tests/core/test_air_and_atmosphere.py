@@ -76,6 +76,16 @@ def test_the_sky_gives_back_no_more_than_the_beam_lost() -> None:
         assert luminance(total) > (0.35 if elevation < 10 else 0.6) * luminance(above)
 
 
+def test_thick_white_haze_transmits_what_two_streams_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gi_core.atmosphere.AEROSOL_ALBEDO", 1.0)
+    air = Atmosphere(2.0, 0.0)
+    sky = horizontal_illuminance(clear_sky(air, towards(90.0), SUN, 0.0))
+    beam = beam_irradiance(air, 90.0, SUN)
+    # Similarity: depth (1 - g) of aerosol, all of the air's; ozone hardly matters in red. The series takes later bounces as isotropic.
+    depth = 0.3 * 2.0 * (600 / 550) ** -1.3 + float(np.interp(600, WAVELENGTH_NM, rayleigh_depth()))
+    assert (sky + beam)[0] / RGB_FROM_SPECTRUM.sum(axis=1)[0] == pytest.approx(1 / (1 + 0.75 * depth), rel=0.08)
+
+
 # Total illuminance on level ground by the sun's elevation: Janiczek and DeYoung, USNO Circular 171, 1987.
 JANICZEK_DEYOUNG = [
     (90, 128e3),

@@ -8,11 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gi_core.atmosphere import atmosphere
 from gi_core.errors import UnknownTimeError, UnknownWeatherError
 from gi_core.lighting import Lighting
-from gi_core.lighting_model import exposure_value, make_lighting
-from gi_core.spectrum import LUMINANCE_FROM_RGB
-from gi_core.sun import sun_position
+from gi_core.lighting_model import MEAN_MOON_DISTANCE_AU, beam_irradiance, exposure_value, make_lighting, moon_spectrum
+from gi_core.spectrum import LUMINANCE_FROM_RGB, RGB_FROM_SPECTRUM
+from gi_core.sun import MoonPosition, sun_position
 from gi_core.weather import WEATHER_RANGES, Weather, weather_presets
 from gi_core.world import Location
 
@@ -216,6 +217,27 @@ def test_no_place_time_or_weather_gives_an_impossible_light(
     light = make_lighting(place, moment.replace(tzinfo=UTC), weather)
     check_form(light)
     assert on_ground(light) < 150e3
+
+
+def test_moonlight_by_phase_and_distance() -> None:
+    def lux(phase: float, distance: float) -> float:
+        moon = MoonPosition(0.0, 45.0, 45.0, distance, phase, 0.5)
+        return float(LUMINANCE_FROM_RGB @ RGB_FROM_SPECTRUM @ moon_spectrum(moon))
+
+    mean = MEAN_MOON_DISTANCE_AU
+    assert lux(0.0, mean) == pytest.approx(10.7639 * 10 ** (-0.4 * 3.84), rel=1e-6)
+    # A half moon gives far less than half: its soil is rough. Between a ninth and a twelfth, by every photometry.
+    assert 9 < lux(0.0, mean) / lux(90.0, mean) < 12
+    assert lux(0.0, 0.9 * mean) / lux(0.0, mean) == pytest.approx(1 / 0.81, rel=1e-9)
+    assert lux(180.0, mean) < 1e-3 * lux(0.0, mean)
+
+
+@pytest.mark.parametrize(("day", "distance"), [("2024-01-03", 0.98331), ("2024-07-05", 1.01673)])
+def test_the_sun_is_stronger_in_january(day: str, distance: float) -> None:
+    light = make_lighting(NEW_YORK, f"{day}T12:00", "clear")
+    elevation = math.degrees(math.asin(light.sun.direction[1]))
+    at_one_au = beam_irradiance(atmosphere(0.15, NEW_YORK.elevation_m / 1000), elevation, np.ones(8))
+    np.testing.assert_allclose(light.sun.irradiance, at_one_au / distance**2, rtol=1e-4)
 
 
 def test_exposure_of_a_grey_scene() -> None:
