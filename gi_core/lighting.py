@@ -22,7 +22,7 @@ class DirectionalLight:
 
 @dataclass(frozen=True, eq=False)
 class Lighting:
-    """Sun, moon and sky at one time and weather.
+    """Sun, moon and sky at one time and weather, as they reach the city: clouds and fog have already dimmed and spread them.
 
     time : ISO 8601 local time; weather : the weather as it was asked for, normalised
     sky_radiance : (64, 128, 3) float32 [cd m^-2 per channel], equirectangular; row i, column j looks along
