@@ -47,7 +47,7 @@ class Effort:
     """points : of each kind in a sector; samples : paths per reference value; seed : of points and paths."""
 
     points: int = 100
-    samples: int = 1024
+    samples: int = 4096
     seed: int = 0
 
 
@@ -57,7 +57,7 @@ def compare_dataset(
     *,
     sectors: Sequence[SectorIndex] | None = None,
     points_per_sector: int = 100,
-    samples: int = 1024,
+    samples: int = 4096,
     seed: int = 0,
     device: str | None = None,
     scene: Scene | None = None,
