@@ -116,6 +116,16 @@ def test_no_almost_good_query_is_our_failure(http: httpx.Client, path: str, chan
     assert http.get(path, params=_encodable({**GOOD, **changes})).status_code < 500
 
 
+EYES = st.tuples(*[st.floats(-1e7, 1e7) | st.floats(-300, 300)] * 3).map(lambda eye: ",".join(f"{v:.17g}" for v in eye))
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True)
+@given(eye=EYES, look=EYES, fov=st.floats(1, 150), gi=st.sampled_from(["on", "off", "split"]))
+def test_no_camera_is_our_failure(http: httpx.Client, eye: str, look: str, fov: float, gi: str) -> None:
+    query: dict[str, Any] = {"time": "12:00", "weather": "clear", "eye": eye, "look": look, "fov": fov, "gi": gi, "width": 16}
+    assert http.get("/v1/preview.png", params=query).status_code < 500
+
+
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True)
 @given(target=st.binary(max_size=60))
 def test_no_bytes_after_the_question_mark_are_our_failure(http: httpx.Client, target: bytes) -> None:

@@ -161,3 +161,16 @@ def test_sector_files_are_the_baked_bytes(http: httpx.Client, city: Path) -> Non
         reply = http.get(entry["href"])
         assert reply.content == (city / "sectors" / f"{x}_{z}.gisec").read_bytes()
         assert len(reply.content) == entry["bytes"]
+
+
+def test_head_is_get_without_the_body(http: httpx.Client, moment: dict[str, Any], place: dict[str, Any]) -> None:
+    for path, query in (
+        ("/healthz", {}),
+        ("/v1/volume", {**moment, **place}),
+        ("/v1/volume", {"time": "never"}),
+        ("/viewer/viewer.js", {}),
+    ):
+        head, whole = http.head(path, params=query), http.get(path, params=query)
+        assert (head.status_code, head.content) == (whole.status_code, b"")
+        for name in ("content-length", "content-type", "etag", "gi-volume"):
+            assert head.headers.get(name) == whole.headers.get(name)
