@@ -28,6 +28,8 @@ SAMPLE_OFFSET_M = VOXEL_SIZE_M / 4
 TILE_M = (np.array([VOLUME_SHAPE[2], VOLUME_SHAPE[0], VOLUME_SHAPE[1]]) - 4) * VOXEL_SIZE_M
 # The pixels that these do not cover are far away and share their nearest volume's edge.
 MAX_VOLUMES = 32
+# Sampling holds some 300 bytes a point: 20 MB.
+SAMPLES_AT_ONCE = 1 << 16
 # What lies beyond the world's edge is drawn as ground of this albedo, in the open; it is not part of the data.
 OUTSIDE_ALBEDO = 0.2
 
@@ -92,9 +94,11 @@ def indirect_irradiance(position: Float64, normal: Float32, volume_at: VolumeAt)
     # sample_volume reads this far off the surface, which may be the next volume's.
     centres, which = plan_volumes(position + SAMPLE_OFFSET_M * normal)
     for i, centre in enumerate(centres):
-        members = np.flatnonzero(which == i)
         volume = volume_at(centre)
-        result[members] = sample_volume(volume.values, volume.origin, volume.voxel_size, position[members], normal[members])
+        members = np.flatnonzero(which == i)
+        for start in range(0, len(members), SAMPLES_AT_ONCE):
+            some = members[start : start + SAMPLES_AT_ONCE]
+            result[some] = sample_volume(volume.values, volume.origin, volume.voxel_size, position[some], normal[some])
     return result
 
 

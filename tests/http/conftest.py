@@ -3,12 +3,12 @@
 import contextlib
 import json
 import socket
-import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +18,13 @@ import uvicorn
 from fastapi import FastAPI
 
 from server.app import create_app
+from server.cli import main
 from server.settings import Settings
 
 SOURCE = "procedural:midtown?blocks=1x1&seed=1"
 STARTUP_S = 60.0  # a fresh process builds its kernels, on a machine that may be busy
 
 Serving = Callable[[FastAPI], AbstractContextManager[httpx.Client]]
-RunCommand = Callable[..., "subprocess.CompletedProcess[str]"]
 
 
 @pytest.fixture(scope="session")
@@ -102,12 +102,26 @@ def problem_of() -> Callable[[httpx.Response], dict[str, Any]]:
     return check
 
 
-@pytest.fixture(scope="session")
-def sectorlight() -> RunCommand:
-    """Runs the command line in a process of its own."""
+@dataclass(frozen=True)
+class Finished:
+    """How a command ended."""
 
-    def run(*arguments: str, timeout: float = 60.0) -> "subprocess.CompletedProcess[str]":
-        command = [sys.executable, "-c", "from server.cli import main; main()", *arguments]
-        return subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False)
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+@pytest.fixture
+def sectorlight(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Callable[..., Finished]:
+    """Runs the command line as its process would, in this one: starting Python for each refusal takes longer than the refusal."""
+
+    def run(*arguments: str) -> Finished:
+        monkeypatch.setattr(sys, "argv", ["sectorlight", *arguments])
+        capfd.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            main()
+        out, err = capfd.readouterr()
+        assert ended.value.code is None or isinstance(ended.value.code, int)
+        return Finished(ended.value.code or 0, out, err)
 
     return run
