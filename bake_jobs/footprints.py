@@ -129,6 +129,8 @@ def _polygons(geometry: Any, where: str) -> Iterator[tuple[Float64, ...]]:
                 rings = [np.array([point[:2] for point in ring], np.float64) for ring in polygon]
                 if rings and len(rings[0]) >= 3:
                     yield tuple(ring.reshape(-1, 2) for ring in rings if len(ring) >= 3)
+    except SourceError:
+        raise
     except (TypeError, ValueError, IndexError, KeyError) as error:
         raise SourceError(f"{where}: expected rings of [longitude, latitude] numbers ({error})") from error
 

@@ -23,7 +23,8 @@ from gi_core.errors import SourceError
 MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply")
 DEFAULT_ALBEDO = 0.5  # of a surface whose file says nothing about its colour
 _GLB_MAGIC, _JSON_CHUNK = 0x46546C67, 0x4E4F534A
-_GLTF_TRIANGLE_MODES = (4, 5)
+_TRIANGLE_FAN = 6
+_MAX_VALUES = 6 * MAX_TRIANGLES  # indices, positions, normals and texture coordinates of the largest mesh
 # Extensions that change where vertices are, and that trimesh does not read.
 _UNREADABLE_EXTENSIONS = ("EXT_meshopt_compression", "KHR_draco_mesh_compression", "EXT_mesh_gpu_instancing")
 
@@ -59,26 +60,15 @@ def load_mesh(path: Path) -> SourceContent:
 def _number_materials(data: bytes, suffix: str, path: Path) -> tuple[bytes, list[dict[str, Any]]]:
     """The file with its materials renamed to their index, so that trimesh's geometry leads back to them; and the materials."""
     try:
-        if suffix == ".glb":
-            head = np.frombuffer(data[:20], "<u4")
-            if (
-                len(head) < 5
-                or head[0] != _GLB_MAGIC
-                or head[1] != 2
-                or head[4] != _JSON_CHUNK
-                or len(data) < max(head[2], 20 + int(head[3]))
-            ):
-                raise ValueError(f"{len(data)} bytes without a whole GLB version 2 header and body")
-            end = 20 + int(head[3])
-            tree, rest = json.loads(data[20:end]), data[end:]
-        else:
-            tree, rest = json.loads(data), b""
-        _refuse_hostile(tree, path)
-        materials = list(tree.get("materials", []))
-        tree["materials"] = [{**material, "name": str(index)} for index, material in enumerate(materials)]
-        if not materials:
-            del tree["materials"]
-    except (ValueError, TypeError, AttributeError, KeyError, RecursionError) as error:
+        text, rest = _glb_json(data) if suffix == ".glb" else (data, b"")
+        tree = json.loads(text)
+        _refuse_unreadable(tree, path)
+        materials = list(tree.pop("materials", []))
+        if materials:
+            tree["materials"] = [{**material, "name": str(index)} for index, material in enumerate(materials)]
+    except SourceError:
+        raise
+    except (ValueError, TypeError, AttributeError, LookupError, RecursionError) as error:
         raise SourceError(f"{path}: expected a glTF 2.0 file, found a broken one ({error}); export it again") from error
     text = json.dumps(tree).encode()
     if suffix == ".gltf":
@@ -88,14 +78,38 @@ def _number_materials(data: bytes, suffix: str, path: Path) -> tuple[bytes, list
     return head.tobytes() + text + rest, materials
 
 
-def _refuse_hostile(tree: dict[str, Any], path: Path) -> None:
-    """Refuse what would be read wrongly, and counts that the reader would allocate before it looks at the data."""
+def _glb_json(data: bytes) -> tuple[bytes, bytes]:
+    """The JSON chunk's text and the chunks after it. Raises ValueError."""
+    head = [int(word) for word in np.frombuffer(data[: len(data[:20]) // 4 * 4], "<u4")]
+    if len(head) < 5 or head[0] != _GLB_MAGIC or head[1] != 2 or head[4] != _JSON_CHUNK:
+        raise ValueError("no GLB version 2 header")
+    end = 20 + head[3]
+    if len(data) < max(head[2], end):
+        raise ValueError(f"{len(data)} of {max(head[2], end)} bytes")
+    return data[20:end], data[end:]
+
+
+def _refuse_unreadable(tree: dict[str, Any], path: Path) -> None:
+    """Refuse what trimesh would read wrongly in silence, and counts that it would allocate before it looks at the data."""
+
+    def refuse(expected: str, found: str) -> None:
+        raise SourceError(f"{path}: expected {expected}, found {found}; export it again without compression")
+
     for extension in tree.get("extensionsRequired", []):
         if extension in _UNREADABLE_EXTENSIONS:
-            raise SourceError(f"{path}: expected plain glTF, found the extension {extension}; export it without compression or instancing")
-    values = sum(int(accessor["count"]) for accessor in tree.get("accessors", []))
-    if values > 6 * MAX_TRIANGLES:
-        raise SourceError(f"{path}: expected at most {MAX_TRIANGLES:,} triangles, found accessors of {values:,} values")
+            refuse("plain glTF", f"the extension {extension}")
+    accessors = tree.get("accessors", [])
+    values = sum(int(accessor["count"]) for accessor in accessors)
+    if values > _MAX_VALUES or any(int(accessor["count"]) < 0 for accessor in accessors):
+        refuse(f"at most {MAX_TRIANGLES:,} triangles", f"accessors of {values:,} values")
+    for mesh in tree.get("meshes", []):
+        for primitive in mesh["primitives"]:
+            if primitive.get("mode", 4) == _TRIANGLE_FAN:
+                refuse("triangles or triangle strips", "a triangle fan")
+            for name in ("POSITION", "TEXCOORD_0"):
+                index = primitive["attributes"].get(name)
+                if index is not None and (accessors[index].get("normalized") or "sparse" in accessors[index]):
+                    refuse(f"{name} as plain numbers", "normalized integers or a sparse accessor")
 
 
 def _placed(mesh: Any, to_world: AnyArray, suffix: str, materials: list[dict[str, Any]]) -> Mesh:

@@ -55,11 +55,15 @@ def gltf_tree(materials, *, nodes=None, uv=None, image=None, primitive=None):
     return tree, data
 
 
-def write_glb(path, tree, data):
+def glb_bytes(tree, data):
     text = json.dumps(tree).encode()
     text += b" " * (-len(text) % 4)
     body = struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(data), 0x004E4942) + data
-    path.write_bytes(struct.pack("<III", 0x46546C67, 2, 12 + len(body)) + body)
+    return struct.pack("<III", 0x46546C67, 2, 12 + len(body)) + body
+
+
+def write_glb(path, tree, data):
+    path.write_bytes(glb_bytes(tree, data))
     return path
 
 
@@ -164,45 +168,52 @@ def test_obj_and_ply_colours(tmp_path):
 
 
 def broken_files():
-    tree, data = gltf_tree([])
-    whole = io.BytesIO()
-    text = json.dumps(tree).encode() + b" " * (-len(json.dumps(tree)) % 4)
-    whole.write(struct.pack("<IIIII", 0x46546C67, 2, 20 + len(text) + 8 + len(data), len(text), 0x4E4F534A) + text)
-    whole.write(struct.pack("<II", len(data), 0x004E4942) + data)
-    glb = whole.getvalue()
-    huge = json.loads(json.dumps(tree))
-    huge["accessors"][0] = {"componentType": 5126, "count": 10**12, "type": "VEC3"}
-    outside = json.loads(json.dumps(tree))
-    outside["meshes"][0]["primitives"][0]["attributes"]["POSITION"] = 7
-    no_material = json.loads(json.dumps(tree))
-    no_material["meshes"][0]["primitives"][0]["material"] = 3
-    packed = {**tree, "extensionsRequired": ["KHR_draco_mesh_compression"]}
+    """What is in the file, and what the error says."""
+
+    def glb():
+        return glb_bytes(*gltf_tree([{}]))
+
+    def gltf(change):
+        tree, data = gltf_tree([{}])
+        tree["buffers"][0]["uri"] = "data:application/octet-stream;base64," + base64.b64encode(data).decode()
+        change(tree)
+        return json.dumps(tree).encode()
+
+    def primitive(**changes):
+        return gltf(lambda tree: tree["meshes"][0]["primitives"][0].update(changes))
+
+    huge = b"ply\nformat binary_little_endian 1.0\nelement vertex 99999999999\nproperty float x\nend_header\n"
     return {
-        "empty.glb": b"",
-        "half.glb": glb[: len(glb) // 2],
-        "cut.glb": glb[:-4],
-        "noise.glb": bytes(range(256)) * 4,
-        "list.gltf": b"[]",
-        "text.gltf": b"not json",
-        "deep.gltf": b"[" * 100_000,
-        "huge.gltf": json.dumps(huge).encode(),
-        "outside.gltf": json.dumps(outside).encode(),
-        "no_material.gltf": json.dumps({**no_material, "materials": [{}]}).encode(),
-        "packed.gltf": json.dumps(packed).encode(),
-        "no_triangles.obj": b"v 0 0 0\n",
-        "noise.ply": b"ply\nformat binary_little_endian 1.0\nelement vertex 99999999999\nproperty float x\nend_header\n",
-        "text.ply": b"hello",
-        "empty.obj": b"",
+        "empty.glb": (b"", "no GLB version 2 header"),
+        "half.glb": (glb()[: len(glb()) // 2], r"\d+ of \d+ bytes"),
+        "cut.glb": (glb()[:-4], r"\d+ of \d+ bytes"),
+        "noise.glb": (bytes(range(256)) * 4, "no GLB version 2 header"),
+        "list.gltf": (b"[]", "expected a glTF 2.0 file"),
+        "text.gltf": (b"not json", "expected a glTF 2.0 file"),
+        "deep.gltf": (b"[" * 100_000, "expected a glTF 2.0 file"),
+        "huge.gltf": (gltf(lambda tree: tree["accessors"][0].update(count=10**12)), "at most 50,000,000 triangles"),
+        "outside.gltf": (primitive(attributes={"POSITION": 7}), "index out of range"),
+        "no_material.gltf": (primitive(material=3), "index out of range"),
+        "fan.gltf": (primitive(mode=6), "found a triangle fan"),
+        "points.gltf": (primitive(mode=0), "expected triangles, found none"),
+        "normalized.gltf": (gltf(lambda tree: tree["accessors"][0].update(normalized=True)), "POSITION as plain numbers"),
+        "packed.gltf": (gltf(lambda tree: tree.update(extensionsRequired=["KHR_draco_mesh_compression"])), "the extension KHR_draco"),
+        "lost_buffer.gltf": (gltf(lambda tree: tree["buffers"][0].update(uri="none.bin")), "broken"),
+        "no_triangles.obj": (b"v 0 0 0\n", "expected triangles, found none"),
+        "empty.obj": (b"", "expected triangles, found none"),
+        "huge.ply": (huge, "broken"),
+        "text.ply": (b"hello", "broken"),
     }
 
 
 @pytest.mark.parametrize("name", broken_files())
 def test_a_broken_file_is_one_clear_line(tmp_path, name):
     path = tmp_path / name
-    path.write_bytes(broken_files()[name])
-    with pytest.raises(SourceError) as error:
+    content, said = broken_files()[name]
+    path.write_bytes(content)
+    with pytest.raises(SourceError, match=said) as error:
         load_scene(path)
-    assert str(path) in str(error.value)
+    assert str(error.value).count(str(path)) == 1
     assert "expected" in str(error.value)
     assert "\n" not in str(error.value)
 
