@@ -65,10 +65,13 @@ class Camera:
 def render(camera: Camera, scene: PreviewScene, lighting: Lighting, volume_at: VolumeAt, indirect: Indirect) -> Float32:
     """Radiance (height, width, 3) float32 [cd m^-2]. ``volume_at`` gives the served volume around a world position (3,) [m]."""
     directions = camera.rays()
-    radiance = background(lighting, directions)
-    if scene.rays is not None:
+    if scene.rays is None:
+        radiance = background(lighting, directions)
+    else:
         surface = scene.rays.first_surface(camera.eye, directions)
-        hit = np.flatnonzero(surface.hit)
+        hit, missed = np.flatnonzero(surface.hit), np.flatnonzero(~surface.hit)
+        radiance = np.empty((len(directions), 3), np.float32)
+        radiance[missed] = background(lighting, directions[missed])
         position, normal, triangle = surface.position[hit], surface.normal[hit], surface.triangle[hit]
         irradiance = np.zeros((len(hit), 3), np.float64)
         for light in lighting.directional_lights:
@@ -108,11 +111,15 @@ def plan_volumes(points: Float64) -> tuple[Float64, Int64]:
     A fixed lattice of overlapping volumes; when more than MAX_VOLUMES would be needed those with the fewest points are left out, and
     their points read the nearest of the others, at its edge.
     """
-    tiles, tile_of, counts = np.unique(np.floor(points / TILE_M).astype(np.int64), axis=0, return_inverse=True, return_counts=True)
-    centres = (tiles + 0.5) * TILE_M
+    tile = np.floor(points / TILE_M).astype(np.int64)
+    first = tile.min(axis=0)
+    shape = tuple(tile.max(axis=0) - first + 1)
+    # One number per tile: sorting rows would take longer than everything else that a picture needs.
+    keys, tile_of, counts = np.unique(np.ravel_multi_index(tuple((tile - first).T), shape), return_inverse=True, return_counts=True)
+    centres = (np.stack(np.unravel_index(keys, shape), axis=1) + first + 0.5) * TILE_M
     kept = np.sort(np.argsort(-counts, kind="stable")[:MAX_VOLUMES])
     distance = np.linalg.norm(centres[:, None] - centres[None, kept], axis=2)
-    return centres[kept], np.argmin(distance, axis=1)[tile_of.reshape(-1)]
+    return centres[kept], np.argmin(distance, axis=1)[tile_of]
 
 
 def background(lighting: Lighting, directions: Float32) -> Float32:
