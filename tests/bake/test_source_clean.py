@@ -80,6 +80,11 @@ def test_a_room_seen_from_within_is_not_turned_into_a_solid():
     assert volume(clean_mesh(join_meshes([furnace, beside]), "with a room", (room,))[0]) == pytest.approx(-60 + 8)
 
 
+def test_a_room_with_a_table_in_it_is_not_turned():
+    furnished = [box_mesh((0, 0, 0), (4, 3, 5), inward=True), box_mesh((1, 0.5, 1), (2, 1, 2)), box_mesh((20, 0, 20), (22, 2, 22))]
+    assert volume(clean_mesh(join_meshes(furnished), "furnished")[0]) == pytest.approx(-60 + 0.5 + 8)
+
+
 def test_an_open_surface_is_never_turned():
     roof = Mesh.of_colour(np.array([[0.0, 5, 0], [1, 5, 0], [0, 5, 1]]), np.array([[0, 1, 2]]), (0.5, 0.5, 0.5))
     mesh, _ = clean_mesh(roof, "roof")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bake_jobs.building import WALL_M
+from bake_jobs.building import CEILING_ALBEDO, FLOOR_ALBEDO, INNER_WALL_ALBEDO, WALL_M
 from bake_jobs.rays import RayScene
 from bake_jobs.scene import scene_digest
 from bake_jobs.scene_source import load_scene
@@ -91,6 +91,8 @@ def test_every_room_is_enclosed_by_thick_walls_but_sees_the_street(city, rays):
                 eye[1] = high[1] - 0.2
                 hit = rays.closest(eye[None], direction[None])
                 assert hit.distance[0] == pytest.approx(abs(face[axis] - eye[axis]), abs=1e-3)  # m: float32 at this distance
+                indoors = {1: {-1: FLOOR_ALBEDO, 1: CEILING_ALBEDO}[sign]}.get(axis, INNER_WALL_ALBEDO)
+                assert city.albedo[hit.triangle[0]] == pytest.approx(np.array(indoors)), "indoor colours"
                 if direction[1] < 0:
                     continue  # below the floor lies the street's surface
                 beyond = eye + direction * (abs(face[axis] - eye[axis]) + 0.1)
