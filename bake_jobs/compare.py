@@ -26,7 +26,7 @@ from bake_jobs.compare_report import StageSamples, summarise
 from bake_jobs.compare_states import DEFAULT_STATES, parse_states
 from bake_jobs.path_tracer import Estimate, PathTracer
 from bake_jobs.scene import Scene
-from gi_core.arrays import Float32
+from gi_core.arrays import Float32, Float64, Int64
 from gi_core.constants import SECTOR_SIZE_M, VOLUME_SHAPE, VOXEL_NO_SECTOR, VOXEL_OUTDOORS
 from gi_core.dataset import Dataset
 from gi_core.engine import Engine
@@ -43,12 +43,24 @@ Progress = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True)
-class Effort:
-    """points : of each kind in a sector; samples : paths per reference value; seed : of points and paths."""
+class Reference:
+    """The path tracer under one lighting. Every call draws its own seed, so that no two stages share their noise."""
 
-    points: int = 100
-    samples: int = 4096
-    seed: int = 0
+    tracer: PathTracer
+    lighting: Lighting
+    samples: int
+    rng: np.random.Generator
+
+    def cubes(self, points: Float64) -> Estimate:
+        """(n, 3) [m] -> Estimate of (n, 6, 3) [lx]."""
+        return self.tracer.cube_irradiance(points, self.lighting, samples=self.samples, seed=self._seed())
+
+    def surfaces(self, points: Float64, normals: Float64) -> Estimate:
+        """(n, 3) [m] and unit normals -> Estimate of (n, 3) [lx]."""
+        return self.tracer.surface_irradiance(points, normals, self.lighting, samples=self.samples, seed=self._seed())
+
+    def _seed(self) -> int:
+        return int(self.rng.integers(1 << 62))
 
 
 def compare_dataset(
@@ -88,7 +100,6 @@ def compare_dataset(
         raise InputError(f"{dataset_path}: basis {world.basis!r}; compare knows 'cube'")
     moments = parse_states(states, world.location)
     chosen = list(sectors) if sectors is not None else choose_sectors(dataset, seed)
-    effort = Effort(points_per_sector, samples, seed)
     engine = Engine(dataset, device)
     lightings = {state.name: engine.lighting(state.time, state.weather) for state in moments}
     tracer = _tracer(dataset, chosen, scene)
@@ -96,8 +107,7 @@ def compare_dataset(
     air = {"open": 0, "called_solid": 0}
 
     for number, index in enumerate(chosen):
-        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(index.x & 0xFFFFFFFF, index.z & 0xFFFFFFFF)))
-        points = choose_points(tracer.rays, dataset.geometry(index), dataset.sector(index), effort.points, rng)
+        points = choose_points(tracer.rays, dataset.geometry(index), dataset.sector(index), points_per_sector, _rng(seed, index))
         for place, (state, lighting) in enumerate(lightings.items()):
             volume = engine.volume(points.eye, lighting)
             if place == 0:
@@ -105,10 +115,11 @@ def compare_dataset(
                 air["open"] += int(known.sum())
                 air["called_solid"] += int((known & (volume.mask < VOXEL_OUTDOORS)).sum())
             stages = found[state]
-            _compare_probes(stages["probes"], engine.lit_sector(index, lighting), points, tracer, lighting, effort)
-            _compare_voxels(stages["near"], volume, points.near, tracer, lighting, effort)
-            _compare_voxels(stages["mid"], volume, points.mid, tracer, lighting, effort)
-            _compare_surfaces(stages["shaded"], stages["floor"], volume, points, tracer, lighting, effort)
+            reference = Reference(tracer, lighting, samples, _rng(seed, index, lighting.digest))
+            stages["probes"].add(engine.lit_sector(index, lighting)[points.probe], reference.cubes(points.probe_position))
+            _compare_voxels(stages["near"], volume, points.near, reference)
+            _compare_voxels(stages["mid"], volume, points.mid, reference)
+            _compare_surfaces(stages["shaded"], stages["floor"], volume, points, reference)
             if progress is not None:
                 progress(number * len(lightings) + place + 1, len(chosen) * len(lightings), f"sector {index.x},{index.z} {state}")
     if not any(samples.count for stages in found.values() for samples in stages.values()):
@@ -159,53 +170,36 @@ def _tracer(dataset: Dataset, chosen: Sequence[SectorIndex], scene: Scene | None
     )
 
 
-def _cubes(tracer: PathTracer, points: Any, lighting: Lighting, effort: Effort) -> Estimate:
-    return tracer.cube_irradiance(points, lighting, samples=effort.samples, seed=effort.seed)
+def _rng(seed: int, index: SectorIndex, digest: str = "") -> np.random.Generator:
+    """The same for a sector, and lighting, whatever else is compared."""
+    key = (index.x & 0xFFFFFFFF, index.z & 0xFFFFFFFF, int(digest[:8] or "0", 16))
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))
 
 
-def _compare_probes(
-    samples: StageSamples, lit: Float32, points: SectorPoints, tracer: PathTracer, lighting: Lighting, effort: Effort
-) -> None:
-    samples.add(lit[points.probe], _cubes(tracer, points.probe_position, lighting, effort))
+def _compare_voxels(samples: StageSamples, volume: Volume, voxels: Int64, reference: Reference) -> None:
+    y, z, x = voxels[volume.mask[tuple(voxels.T)] != VOXEL_NO_SECTOR].T
+    centre = voxel_centre(np.stack([x, y, z], axis=1) + volume.first_voxel)
+    samples.add(volume.values[:, y, z, x].transpose(1, 0, 2), reference.cubes(centre))
 
 
-def _compare_voxels(samples: StageSamples, volume: Volume, voxels: Any, tracer: PathTracer, lighting: Lighting, effort: Effort) -> None:
-    y, z, x = voxels.T
-    centre = voxel_centre(voxels[:, [2, 0, 1]] + volume.first_voxel)
-    known = volume.mask[y, z, x] != VOXEL_NO_SECTOR
-    served = volume.values[:, y, z, x].transpose(1, 0, 2)
-    samples.add(served[known], _cubes(tracer, centre[known], lighting, effort))
-
-
-def _compare_surfaces(
-    shaded: StageSamples,
-    floor: StageSamples,
-    volume: Volume,
-    points: SectorPoints,
-    tracer: PathTracer,
-    lighting: Lighting,
-    effort: Effort,
-) -> None:
+def _compare_surfaces(shaded: StageSamples, floor: StageSamples, volume: Volume, points: SectorPoints, reference: Reference) -> None:
     """Both stages on surfaces share their reference."""
     normal = points.normal.astype(np.float32)
 
     def as_client(values: Float32) -> Float32:
         return sample_volume(values, volume.origin, volume.voxel_size, points.surface, normal)
 
-    reference = tracer.surface_irradiance(points.surface, points.normal, lighting, samples=effort.samples, seed=effort.seed)
-    shaded.add(as_client(volume.values), reference)
+    truth = reference.surfaces(points.surface, points.normal)
+    shaded.add(as_client(volume.values), truth)
     if not points.open_voxel.any():
         return
     corner = corner_voxels(points.surface + CLIENT_OFFSET_M * points.normal, volume.origin).reshape(-1, 3)
-    corner = np.unique(corner, axis=0)
-    source = nearest_open_voxel(points.open_voxel)[:, *corner.T].T
+    y, z, x = np.unique(corner, axis=0).T
+    source = nearest_open_voxel(points.open_voxel)[:, y, z, x].T
     needed, which = np.unique(source, axis=0, return_inverse=True)
-    exact = _cubes(tracer, voxel_centre(needed[:, [2, 0, 1]] + volume.first_voxel), lighting, effort)
-    values = np.zeros((6, *VOLUME_SHAPE, 3), np.float32)
-    values[:, *corner.T] = exact.mean[which.reshape(-1)].transpose(1, 0, 2)
-    rebuilt = as_client(values)
-    noise = np.zeros((6, *VOLUME_SHAPE, 3), np.float32)
-    noise[:, *corner.T] = exact.standard_error[which.reshape(-1)].transpose(1, 0, 2)
+    exact = reference.cubes(voxel_centre(needed[:, [2, 0, 1]] + volume.first_voxel))
+    values, noise = np.zeros((2, 6, *VOLUME_SHAPE, 3), np.float32)
+    values[:, y, z, x] = exact.mean[which.reshape(-1)].transpose(1, 0, 2)
+    noise[:, y, z, x] = exact.standard_error[which.reshape(-1)].transpose(1, 0, 2)
     # Corners' errors are independent, so their weighted sum overstates the noise: an upper bound.
-    rebuilt_noise = as_client(noise)
-    floor.add(rebuilt, Estimate(reference.mean, np.hypot(reference.standard_error, rebuilt_noise)))
+    floor.add(as_client(values), Estimate(truth.mean, np.hypot(truth.standard_error, as_client(noise))))

@@ -118,7 +118,7 @@ def draw_chart(report: dict[str, Any]) -> Image.Image:
     group = width / len(stages)
     bar = 0.8 * group / len(states)
     for place, stage in enumerate(stages):
-        draw.text((left + group * (place + 0.5), top + height + 10), stage, fill="black", anchor="mt")
+        draw.text((left + group * (place + 0.5), top + height + 10), stage, fill="black", anchor="ma")
         for number, numbers in enumerate(states.values()):
             if numbers[stage]["median"] is None:
                 continue

@@ -31,23 +31,26 @@ class PlainDataset:
     """Sectors of bare ground, four probes each."""
 
     path = "plain"
+    wall_height_m = 0.0  # of a black wall along z through the middle of every sector
 
     def __init__(self, sectors=PLAIN):
         self.world = SimpleNamespace(preset="talk", basis="cube", location=Location(), sectors=sectors, bake_id="ab")
 
     def geometry(self, index):
         corners = index.origin + 64 * np.array([[0, 0, 0], [0, 0, 1], [1, 0, 1], [1, 0, 0]]) + [0, GROUND_M, 0]
-        return Geometry(
-            corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32), np.full((2, 3), ALBEDO, np.float32), np.zeros((2, 3), np.float32)
-        )
+        wall = index.origin + [[32, GROUND_M + h, z] for h, z in ((0, 0), (0, 64), (self.wall_height_m, 64), (self.wall_height_m, 0))]
+        triangles = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], np.int32)[: 4 if self.wall_height_m else 2]
+        albedo = np.array([[ALBEDO] * 3] * 2 + [[0.0] * 3] * 2, np.float32)[: len(triangles)]
+        return Geometry(np.concatenate([corners, wall]), triangles, albedo, np.zeros_like(albedo))
 
     def sector(self, index):
         position = np.array([[8, 4, 8], [50, 4, 8], [8, 9, 50], [50, 14, 50]], np.float32)
         return SimpleNamespace(index=index, probe_position=position, probe_room=np.zeros(4, np.uint16), probe_flags=np.zeros(4, np.uint8))
 
 
-def plain_engine(factor=1.0, no_sector_from=32, solid_from=32):
-    """Serves the plain's light times a factor. Voxel columns from an x index on are without a sector, or called solid."""
+def plain_engine(factor=1.0, high_factor=1.0, no_sector_from=32, solid_from=32):
+    """Serves the plain's light times a factor, that of voxels 5 m up or more times another one too. Voxel columns from an x index on
+    are without a sector, or called solid."""
 
     class Engine:
         def __init__(self, dataset, device):
@@ -67,6 +70,7 @@ def plain_engine(factor=1.0, no_sector_from=32, solid_from=32):
             values = factor * np.broadcast_to(plain_cube()[:, None, None, None], (6, *VOLUME_SHAPE, 3)).astype(np.float32)
             mask = np.full(VOLUME_SHAPE, VOXEL_OUTDOORS, np.uint8)
             heights = voxel_centre(first + np.arange(VOLUME_SHAPE[0])[:, None])[:, 1]
+            values[:, heights > GROUND_M + 5] *= high_factor
             mask[heights < GROUND_M] = VOXEL_SOLID
             mask[:, :, solid_from:] = VOXEL_SOLID
             mask[:, :, no_sector_from:] = VOXEL_NO_SECTOR
@@ -114,6 +118,35 @@ def test_wrong_light_shows_everywhere_but_in_the_floor(run):
 def test_black_light_is_wholly_wrong(run):
     stages = run(plain_engine(0.0))["states"]["noon"]
     assert all(stages[stage]["bias"] == -1 for stage in STAGES[:-1])
+
+
+def test_voxels_are_read_at_their_own_height(run):
+    stages = run(plain_engine(high_factor=1.5), samples=256)["states"]["noon"]
+    assert stages["mid"]["bias"] == pytest.approx(0.5, abs=2 * CLOSE)
+    assert abs(stages["near"]["bias"]) < 2 * CLOSE
+
+
+def test_references_are_taken_where_the_voxels_are(run, monkeypatch):
+    asked = []
+    cubes = compare.Reference.cubes
+    monkeypatch.setattr(compare.Reference, "cubes", lambda self, points: (asked.append(points), cubes(self, points))[1])
+    run(samples=64, sectors=[SectorIndex(2, -3)])
+    probes, near, mid, corners = asked
+    assert len(probes) == 4
+    for points in (probes, near, mid):
+        assert ((points[:, [0, 2]] >= [128, -192]) & (points[:, [0, 2]] < [192, -128])).all()
+    assert ((near[:, 1] > GROUND_M) & (near[:, 1] < GROUND_M + 3.2)).all()
+    assert (mid[:, 1] > GROUND_M + 5.9).all()  # within 1 % of 6 m
+    assert ((corners[:, 1] > GROUND_M) & (corners[:, 1] < GROUND_M + 3.125 + 0.79)).all()
+
+
+def test_floor_follows_light_that_varies(run, monkeypatch):
+    # A black wall dims one side of everything, along x alone: exact voxels put at the wrong place would be off by tens of percents.
+    monkeypatch.setattr(PlainDataset, "wall_height_m", 40.0)
+    stages = run(points_per_sector=60, samples=512)["states"]["noon"]
+    assert stages["floor"]["median"] < 0.05
+    assert stages["floor"]["nrmse"] < 0.18  # next to the wall trilinear sampling reads through it
+    assert stages["shaded"]["nrmse"] > 0.3
 
 
 def test_the_same_arguments_give_the_same_report(run):

@@ -22,6 +22,7 @@ trimesh = pytest.importorskip("trimesh")
 pytestmark = pytest.mark.slow
 
 MUNICH = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "munich.glb"
+# What is left of the interpolation under the open sky: 0.06 % at 8, 0.04 % at 16, against noise of 0.05 to 0.14 % here.
 SKY_ENLARGEMENT = 16
 METER_SIZE_M = 1e-3
 REPLICATES = 16
