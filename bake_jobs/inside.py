@@ -6,11 +6,13 @@ may also be open (a house without a floor) or a sheet (a canopy), so several ray
 
 import numpy as np
 
-from bake_jobs.rays import SURFACE_OFFSET_M, RayScene
+from bake_jobs.rays import RayScene
 from gi_core.arrays import Bool, Float32, Float64
 
 # A ray that has crossed this many surfaces is believed as it stands: overlapping parts of a tower have some ten.
 MAX_CROSSINGS = 64
+# Less than the distance between walls that footprints keep apart (3 mm), more than float32 leaves of a position 2 km away (0.1 mm).
+STEP_M = 0.001
 # Straight up, four ways steeply, four ways nearly level. Turned away from the axes, since walls run along them and a ray in a wall's
 # plane crosses it by luck.
 _AZIMUTHS = np.radians([17.0, 107.0, 197.0, 287.0])
@@ -54,6 +56,6 @@ def _net_exits(ray_scene: RayScene, origins: Float64, directions: Float32) -> "n
         if len(going) == 0:
             break
         net[going] += np.where(hits.from_back[hit], 1, -1)
-        step = hits.distance[hit].astype(np.float64) + SURFACE_OFFSET_M
+        step = hits.distance[hit].astype(np.float64) + STEP_M
         position = position[hit] + directions[going] * step[:, None]
     return net

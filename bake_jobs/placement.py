@@ -90,7 +90,7 @@ def room_of(position: Float64, rooms: tuple[Room, ...]) -> UInt16:
 def _lattice(low: float, high: float, spacing: float) -> Float64:
     """Multiples of the spacing plus one half of it within [low, high)."""
     first, last = (int(np.ceil(edge / spacing - 0.5)) for edge in (low, high))
-    return (np.arange(first, last) + 0.5) * spacing
+    return np.asarray((np.arange(first, last) + 0.5) * spacing, np.float64)
 
 
 def _march(ray_scene: RayScene, origins: Float64, direction: tuple[float, float, float], reach: float) -> tuple[Float64, Float64]:

@@ -16,7 +16,7 @@ _UNKNOWN = b"generic\0"
 _SEARCHED_BYTES = 2048
 _MEMORY = Path("/proc/self/mem")
 # LLVM's name for a processor, and the flags without which its code would not run. Names fit the 8 bytes of what they replace.
-_TARGETS = (
+_TARGETS: tuple[tuple[bytes, set[str]], ...] = (
     (b"znver3", {"avx2", "fma", "bmi2", "sha_ni", "sse4a", "vaes", "vpclmulqdq", "clwb", "clzero", "rdpid", "fsgsbase", "adx"}),
     (b"haswell", {"avx2", "fma", "bmi1", "bmi2", "f16c", "movbe", "fsgsbase"}),
     (b"x86-64", set()),

@@ -136,23 +136,22 @@ def check_sector(sector: Sector, sky_patches: int) -> None:
     expect_starts(s.factor_starts, s.probe_count, s.factor_count, "factor_starts")
     expect_starts(s.brick_starts, s.brick_count, s.surfel_count, "brick_starts")
     expect((counts(s.brick_starts) > 0).all(), "no empty brick")
-    per_probe: dict[str, AnyArray] = {"probe_flags": s.probe_flags, "probe_room": s.probe_room}
-    per_surfel: dict[str, AnyArray] = {
-        "surfel_normal": s.surfel_normal,
-        "surfel_albedo": s.surfel_albedo,
-        "surfel_snow": s.surfel_snow,
-        "feedback_probe": s.feedback_probe,
-        "feedback_weight": s.feedback_weight,
-    }
-    if s.surfel_emission is not None:
-        per_surfel["surfel_emission"] = s.surfel_emission
-    for name, values in per_probe.items():
-        expect(len(values) == s.probe_count, f"{name} for {s.probe_count} probes, got {len(values)}")
-    for name, values in per_surfel.items():
-        expect(len(values) == s.surfel_count, f"{name} for {s.surfel_count} surfels, got {len(values)}")
+    for items, name, shape in (
+        (s.probe_count, "probe_position", (3,)),
+        (s.probe_count, "probe_flags", ()),
+        (s.probe_count, "probe_room", ()),
+        (s.factor_count, "factor_weight", (6,)),
+        (s.brick_count, "brick_cell", (3,)),
+        (s.brick_count, "brick_level", ()),
+        (s.surfel_count, "surfel_normal", (3,)),
+        (s.surfel_count, "surfel_albedo", (3,)),
+        (s.surfel_count, "surfel_snow", ()),
+        (s.surfel_count, "surfel_emission", (3,)),
+        (s.surfel_count, "feedback_probe", s.feedback_probe.shape[1:2]),
+    ):
+        values = getattr(s, name)
+        expect(values is None or values.shape == (items, *shape), f"{name} of shape {(items, *shape)}, got {np.shape(values)}")
     expect(s.feedback_probe.shape == s.feedback_weight.shape, "as many feedback weights as probes")
-    expect(len(s.factor_weight) == s.factor_count, f"weights for {s.factor_count} factors, got {len(s.factor_weight)}")
-    expect(len(s.brick_cell) == s.brick_count, f"cells for {s.brick_count} bricks, got {len(s.brick_cell)}")
     expect(s.sun_visibility.shape[1] == (s.surfel_count + 31) // 32, f"sun visibility planes of {s.surfel_count} bits")
     expect(s.voxel_class.ndim == 3 and s.voxel_room.shape == s.voxel_class.shape, "one class and one room per voxel")
     expect(s.voxel_probe.shape[:3] == s.voxel_class.shape, "one probe list per voxel")
@@ -165,7 +164,6 @@ def check_sector(sector: Sector, sky_patches: int) -> None:
     else:
         expect(not s.feedback_weight.any() and not s.voxel_weight.any(), "no weights in a sector without probes")
     expect(s.brick_direction.max(initial=0) < 6, "brick directions below 6")
-    expect(len(s.brick_level) == s.brick_count, f"levels for {s.brick_count} bricks, got {len(s.brick_level)}")
     expect(s.brick_level.max(initial=0) <= MAX_BRICK_LEVEL, f"brick levels up to {MAX_BRICK_LEVEL}")
     expect(s.voxel_class.max(initial=0) <= 2, "voxel classes 0..2")
     for field in fields(s):

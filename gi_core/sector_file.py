@@ -8,7 +8,7 @@ import numpy as np
 
 from gi_core import container, quantise
 from gi_core.arrays import AnyArray, Float32, UInt8
-from gi_core.constants import BRICK_CELL_M
+from gi_core.constants import BRICK_CELL_M, MAX_BRICK_LEVEL
 from gi_core.container import Container
 from gi_core.errors import CorruptFileError
 from gi_core.grid import SectorIndex
@@ -135,6 +135,8 @@ def _encode_weights(s: Sector) -> tuple[UInt8, AnyArray]:
 
 def _decode_weights(codes: AnyArray, scales: AnyArray, factor_starts: AnyArray, is_sky: AnyArray) -> Float32:
     probe = _probe_of_factor(factor_starts)
+    if not np.isfinite(scales).all():
+        raise CorruptFileError("factor_scale is not finite")
     scale = scales.astype(np.float32)[is_sky.astype(np.int64), :, probe]  # (F, B)
     return np.ascontiguousarray(quantise.decode_root(codes).T * scale)
 
@@ -143,12 +145,14 @@ def _sector(found: Container) -> Sector:
     take = found.take
     factor_starts, brick_starts = starts(take("factor_count", "u2", 1)), starts(take("brick_count", "u2", 1))
     brick_cell = np.ascontiguousarray(take("brick_cell", "i4", 2).T)
+    brick_level = take("brick_level", "u1", 1)
     source = take("factor_source", "u4", 1)
     in_cell = take("surfel_in_cell", "u1", 2).T
     # A wrong count would otherwise size the arrays that np.repeat makes.
     if int(factor_starts[-1]) != len(source) or int(brick_starts[-1]) != len(in_cell) or len(brick_cell) != len(brick_starts) - 1:
         raise CorruptFileError("counts per probe or brick do not add up")
-    brick_level = take("brick_level", "u1", 1)
+    if brick_level.max(initial=0) > MAX_BRICK_LEVEL:
+        raise CorruptFileError(f"expected brick levels up to {MAX_BRICK_LEVEL}, got {brick_level.max()}")
     cell, size = _surfel_cells(brick_cell, brick_level, brick_starts)
     position = (cell + (in_cell.astype(np.float64) + 0.5) / _CELL_STEPS) * size
     feedback = take("feedback_probe", "u2", 2).T

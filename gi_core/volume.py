@@ -7,7 +7,7 @@ import numpy as np
 
 from gi_core.ambient_cube import basis_weights
 from gi_core.arrays import AnyArray, Float32, Float64, Int64, UInt8
-from gi_core.constants import VOLUME_SHAPE, VOXEL_INDOORS, VOXEL_NO_SECTOR, VOXEL_OUTDOORS, VOXEL_SIZE_M, VOXEL_SOLID
+from gi_core.constants import SECTOR_SIZE_M, VOLUME_SHAPE, VOXEL_INDOORS, VOXEL_NO_SECTOR, VOXEL_OUTDOORS, VOXEL_SIZE_M, VOXEL_SOLID
 from gi_core.grid import SectorIndex, voxel_centre, voxel_columns
 from gi_core.layout import VOLUME_BOX
 from gi_core.sector import Sector
@@ -74,7 +74,7 @@ def plan_boxes(first_voxel: Int64) -> list[SectorBox]:
 def _split(first: int, count: int) -> list[tuple[int, int, int]]:
     """Runs (sector, first voxel, past the last) along one axis."""
     runs = []
-    sector = int(np.floor(voxel_centre(np.int64(first)) / 64.0))
+    sector = int(np.floor(voxel_centre(np.array([first]))[0] / SECTOR_SIZE_M))
     at = first
     while at < first + count:
         end = min(voxel_columns(sector)[1], first + count)

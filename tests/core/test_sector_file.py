@@ -1,0 +1,133 @@
+"""Sectors survive their file within its precision, and files that lie are refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gi_core import container, quantise, sector_file
+from gi_core.errors import CorruptFileError
+from gi_core.sector import counts
+from gi_core.sector_file import KIND, VERSION
+
+PATCHES = 6
+
+
+def face_sums(sector):
+    probe = np.repeat(np.arange(sector.probe_count), counts(sector.factor_starts))
+    return np.stack([np.bincount(probe, sector.factor_weight[:, b], sector.probe_count) for b in range(6)], axis=1)
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        {},
+        {"emits": True},
+        {"feedback": 3},
+        {"probes": 1},
+        {"probes": 1000},
+        {"surfels": 0},
+        {"probes": 0, "surfels": 0},
+        {"voxel_probes": 8},
+    ],
+    ids=str,
+)
+def test_a_sector_survives_its_file(make_sector, shape):
+    sector = make_sector(1, **shape)
+    found, meta = sector_file.decode(sector_file.encode(sector, {"bake_id": "x"}, PATCHES), "here")
+    assert meta == {"bake_id": "x"}
+    assert found.index == sector.index
+    for name in ("factor_starts", "factor_source", "brick_starts", "brick_level", "brick_cell", "brick_direction", "sun_visibility"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(sector, name))
+    for name in ("voxel_class", "voxel_room", "voxel_first", "probe_flags", "probe_room", "feedback_probe", "voxel_probe"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(sector, name))
+    # Half a step of 1/512 m, and float32's own 4e-6 at 64 m.
+    np.testing.assert_allclose(found.probe_position, sector.probe_position, atol=0.5 / 512 + 1e-5)
+    if sector.surfel_count:
+        size = 4.0 * 2.0 ** np.repeat(sector.brick_level, counts(sector.brick_starts))[:, None]
+        assert (np.abs(found.surfel_position - sector.surfel_position) <= size / 512 + 1e-3).all()
+        assert np.degrees(np.arccos(np.clip((found.surfel_normal * sector.surfel_normal).sum(axis=1), -1, 1))).max() < 0.95
+        # The square root's step is 1/255: at most 2 sqrt(a) / 510 + (1/510)^2.
+        assert (np.abs(found.surfel_albedo - sector.surfel_albedo) <= np.sqrt(sector.surfel_albedo) / 255 + 4e-6).all()
+    np.testing.assert_allclose(found.voxel_weight, sector.voxel_weight, atol=1.5 / 255)
+    if sector.surfel_emission is not None:
+        np.testing.assert_array_equal(found.surfel_emission, sector.surfel_emission)
+    else:
+        assert found.surfel_emission is None
+
+
+def test_a_probe_neither_gains_nor_loses_light_in_the_file(make_sector):
+    sector = make_sector(2)
+    before, after = face_sums(sector), face_sums(sector_file.quantised(sector, PATCHES))
+    assert (after <= before + 1e-6).all()
+    # float16 scales are rounded down, by one part in 1024 at most; float32 sums add 1e-6.
+    np.testing.assert_allclose(after, before, rtol=1 / 1024 + 2e-6)
+
+
+def test_writing_what_was_read_gives_the_same_arrays_but_for_scales(make_sector):
+    once = sector_file.quantised(make_sector(3), PATCHES)
+    twice = sector_file.quantised(once, PATCHES)
+    assert (np.abs(once.factor_weight - twice.factor_weight) <= once.factor_weight / 500 + 1e-7).all()
+    np.testing.assert_array_equal(once.surfel_position, twice.surfel_position)
+    np.testing.assert_array_equal(once.surfel_normal, twice.surfel_normal)
+    np.testing.assert_array_equal(once.surfel_albedo, twice.surfel_albedo)
+
+
+@pytest.mark.parametrize(
+    ("array", "change"),
+    [
+        ("factor_source", lambda a: np.full_like(a, 10_000_000)),
+        ("feedback_probe", lambda a: np.full_like(a, 60_000)),
+        ("voxel_probe", lambda a: np.full_like(a, 999)),
+        ("factor_count", lambda a: np.full_like(a, 65_535)),
+        ("brick_count", lambda a: np.full_like(a, 65_535)),
+        ("brick_count", lambda a: np.concatenate([[0, a[0] + a[1]], a[2:]]).astype(a.dtype)),
+        ("brick_direction", lambda a: np.full_like(a, 6)),
+        ("brick_level", lambda a: np.full_like(a, 200)),
+        ("factor_scale", lambda a: np.full_like(a, np.inf)),
+        ("factor_scale", lambda a: np.full_like(a, np.nan)),
+        ("factor_scale", lambda a: -a - 1),
+        ("voxel_class", lambda a: np.full_like(a, 3)),
+        ("voxel_class", lambda a: a[:1]),
+        ("sun_visibility", lambda a: a[:, :-1]),
+        ("surfel_normal", lambda a: a[:, :-1]),
+        ("probe_flags", lambda a: a[:-1]),
+        ("probe_position", lambda a: a[:2]),
+        ("voxel_weight", lambda a: a.astype(np.uint16)),
+    ],
+    ids=lambda v: v if isinstance(v, str) else "",
+)
+def test_an_array_that_does_not_fit_the_others_is_refused(make_sector, array, change):
+    found = container.decode(sector_file.encode(make_sector(4), {}, PATCHES), KIND, VERSION, "here")
+    arrays = dict(found.arrays)
+    arrays[array] = change(arrays[array])
+    with pytest.raises(CorruptFileError, match="bad.gisec"):
+        sector_file.decode(container.encode(KIND, VERSION, found.meta, arrays), "bad.gisec")
+
+
+def test_a_missing_array_or_meta_is_refused(make_sector):
+    found = container.decode(sector_file.encode(make_sector(4), {}, PATCHES), KIND, VERSION, "here")
+    for name in found.arrays:
+        rest = {key: value for key, value in found.arrays.items() if key != name}
+        with pytest.raises(CorruptFileError, match="bad.gisec"):
+            sector_file.decode(container.encode(KIND, VERSION, found.meta, rest), "bad.gisec")
+    for name in found.meta:
+        rest = {key: value for key, value in found.meta.items() if key != name}
+        with pytest.raises(CorruptFileError, match="bad.gisec"):
+            sector_file.decode(container.encode(KIND, VERSION, rest, found.arrays), "bad.gisec")
+
+
+def test_more_than_a_thousand_probes_are_refused(make_sector):
+    with pytest.raises(CorruptFileError, match="1000 probes"):
+        sector_file.quantised(make_sector(5, probes=1001), PATCHES)
+
+
+def test_octahedral_axes_are_exact():
+    axes = np.concatenate([np.eye(3), -np.eye(3)])
+    np.testing.assert_array_equal(quantise.decode_unit(quantise.encode_unit(axes)), axes.astype(np.float32))
+
+
+def test_a_surfel_outside_its_cell_stays_finite(make_sector):
+    sector = make_sector(6)
+    outside = replace(sector, surfel_position=sector.surfel_position + np.float32(3.0))
+    assert np.isfinite(sector_file.quantised(outside, PATCHES).surfel_position).all()

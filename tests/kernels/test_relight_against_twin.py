@@ -1,0 +1,175 @@
+"""Kernels equal their NumPy twins on random sectors, on every device found; the fixed point equals a float64 solve."""
+
+from dataclasses import replace
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+from gi_core import layout, pocl_cpu, relight_twin
+from gi_core.device import Device, available_devices, choose_device, describe, shared_device
+from gi_core.errors import DeviceError, KernelBuildError
+from gi_core.layout import DIRECTIONAL_LIGHT
+from gi_core.relight import Relighter, ResidentSector
+from gi_core.relight_input import RelightInput
+from gi_core.volume import box_record, plan_boxes
+from kernels_cl import include_directory
+
+PATCHES = 6
+# Sums of at most 40 surfels and 30 factors in float32, in the twin's order or another; worst seen 6e-7 of the peak.
+CLOSE = 4e-6
+
+
+@pytest.fixture(scope="module", params=[describe(d) for d in available_devices()])
+def device(request) -> Device:
+    return shared_device(request.param)
+
+
+def given_light(seed: int, lights: int, planes: int = 12) -> RelightInput:
+    rng = np.random.default_rng(seed)
+    records = np.zeros(lights, DIRECTIONAL_LIGHT.dtype)
+    for record in records:
+        direction = rng.normal(size=3)
+        record["direction"][:3] = direction / np.linalg.norm(direction)
+        record["irradiance"][:3] = rng.uniform(0, 1e5, 3)
+        record["plane"] = rng.integers(0, planes, 4)
+        weight = rng.uniform(0, 1, 4)
+        record["plane_weight"] = weight / weight.sum()
+    return RelightInput(rng.uniform(0, 2e4, (PATCHES, 3)).astype(np.float32), records)
+
+
+SHAPES = [
+    {},
+    {"emits": True},
+    {"feedback": 4},
+    {"probes": 1},
+    {"probes": 1000, "surfels": 3000},
+    {"surfels": 1},
+    {"surfels": 0},
+    {"probes": 0},
+]
+
+
+@pytest.mark.parametrize("lights", [0, 1, 2])
+@pytest.mark.parametrize("shape", SHAPES, ids=str)
+def test_three_passes_equal_the_twins(device, make_sector, shape, lights):
+    sector = make_sector(7, **shape)
+    given = given_light(lights, lights)
+    resident = ResidentSector(device, sector, PATCHES)
+    start = np.random.default_rng(8).uniform(0, 1e4, (sector.probe_count, 6, 3)).astype(np.float32)
+    resident.write_cubes(start)
+    Relighter(device).relight([resident], given, 3)
+    expected = relight_twin.relight(sector, given, start, 3)
+    peak = expected.max(initial=1e-9)
+    np.testing.assert_allclose(resident.read_cubes() / peak, expected / peak, atol=CLOSE)
+
+
+def test_two_sectors_in_one_call_equal_each_alone(device, make_sector):
+    given = given_light(3, 1)
+    together = [ResidentSector(device, make_sector(seed), PATCHES) for seed in (1, 2)]
+    Relighter(device).relight(together, given, 4)
+    for resident in together:
+        alone = ResidentSector(device, resident.sector, PATCHES)
+        Relighter(device).relight([alone], given, 4)
+        np.testing.assert_array_equal(resident.read_cubes(), alone.read_cubes())
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_convergence_reaches_the_float64_solve(device, make_sector, seed):
+    sector = make_sector(seed, emits=seed % 2 == 1)
+    given = given_light(seed, seed % 3)
+    found = Relighter(device).converge(ResidentSector(device, sector, PATCHES), given)
+    truth = relight_twin.solve(sector, given)
+    # The contract: within 1e-4 of the peak. The residual asked for is 1e-5.
+    assert np.abs(found.cubes - truth).max() <= 1e-4 * truth.max()
+    assert found.residual <= 1e-5
+
+
+def test_feedback_is_a_contraction_at_the_highest_albedo(device, make_sector):
+    sector = make_sector(9)
+    # Every probe sees nothing but surfels, and every surfel reflects all that it may.
+    white = replace(sector, surfel_albedo=np.full_like(sector.surfel_albedo, 0.95))
+    resident = ResidentSector(device, white, PATCHES)
+    resident.write_cubes(np.full((white.probe_count, 6, 3), 1e6, np.float32))
+    dark = RelightInput(np.zeros((PATCHES, 3), np.float32), np.zeros(0, DIRECTIONAL_LIGHT.dtype))
+    peaks = []
+    for _ in range(20):
+        Relighter(device).relight([resident], dark, 1)
+        peaks.append(resident.read_cubes().max())
+    # Form factors sum to one within float32: a pass keeps at most 95 % of the light.
+    assert all(after <= before * 0.9501 for before, after in zip([1e6, *peaks], peaks, strict=False))
+
+
+def test_the_same_input_gives_the_same_bytes(device, make_sector):
+    sector, given = make_sector(10), given_light(10, 2)
+    runs = [Relighter(device).converge(ResidentSector(device, sector, PATCHES), given).cubes.tobytes() for _ in range(3)]
+    assert runs[0] == runs[1] == runs[2]
+
+
+def test_no_light_is_exactly_dark(device, make_sector):
+    dark = RelightInput(np.zeros((PATCHES, 3), np.float32), np.zeros(0, DIRECTIONAL_LIGHT.dtype))
+    assert not Relighter(device).converge(ResidentSector(device, make_sector(11), PATCHES), dark).cubes.any()
+
+
+def test_a_volume_equals_the_twins_blend(device, make_sector):
+    sector = make_sector(12)
+    resident = ResidentSector(device, sector, PATCHES)
+    cubes = np.random.default_rng(12).uniform(0, 1e4, (sector.probe_count, 6, 3)).astype(np.float32)
+    resident.write_cubes(cubes)
+    box = next(b for b in plan_boxes(np.array([0, -1, 0])) if b.index == sector.index)
+    target = device.allocate(6 * 16 * 32 * 32 * 3 * 4)
+    kernel = device.kernel("fill_volume", BASIS_SIZE=6, VOXEL_PROBES=4)
+    record = device.upload(box_record(box, sector))  # a kernel does not keep its arguments alive
+    kernel.set_args(record, resident.voxel_probe, resident.voxel_weight, resident.cubes, target)
+    cl.enqueue_nd_range_kernel(device.queue, kernel, tuple(int(n) for n in box.size), None)
+    values = np.zeros((6, 16, 32, 32, 3), np.float32)
+    device.read(target, values)
+    expected = relight_twin.blend_voxels(sector, cubes)
+    (nx, ny, nz) = box.size
+    np.testing.assert_allclose(values[:, :4, :nz, :nx], np.moveaxis(expected[:, :nz, :nx], 3, 0), rtol=2e-5)
+    # Above its layers a sector repeats the highest.
+    np.testing.assert_array_equal(values[:, ny - 1, :nz, :nx], values[:, 3, :nz, :nx])
+
+
+def test_the_generated_header_is_in_step():
+    assert (include_directory() / "layout.h").read_text() == layout.header_text()
+
+
+def test_records_are_whole_vectors():
+    for record in layout.RECORDS:
+        assert record.dtype.itemsize % 16 == 0, record.name
+
+
+def test_an_unknown_device_is_refused_with_the_list():
+    with pytest.raises(DeviceError) as caught:
+        choose_device("abacus")
+    assert "abacus" in str(caught.value)
+    assert describe(available_devices()[0]) in str(caught.value)
+
+
+def test_a_kernel_that_does_not_build_shows_the_compilers_words(device):
+    with pytest.raises(KernelBuildError, match=r"broken\.cl(.|\n)*nonsense"):
+        device.build("__kernel void k() { nonsense; }", "broken.cl")
+
+
+def test_a_missing_define_stops_the_build(device):
+    with pytest.raises(KernelBuildError, match="FEEDBACK_PROBES"):
+        device.kernel("relight_bricks", DIRECTIONAL_LIGHTS=1, HAS_EMISSION=0)
+
+
+@pytest.mark.parametrize(
+    ("flags", "name"),
+    [
+        ({"avx2", "fma", "bmi1", "bmi2", "f16c", "movbe", "fsgsbase"}, b"haswell"),
+        (pocl_cpu._TARGETS[0][1] | pocl_cpu._TARGETS[1][1], b"znver3"),
+        ({"sse2"}, b"x86-64"),
+    ],
+)
+def test_a_processor_too_new_for_the_compiler_gets_a_compatible_name(flags, name):
+    assert pocl_cpu.compatible_cpu(flags) == name
+    assert len(name) < len(pocl_cpu._UNKNOWN)
+
+
+def test_only_the_build_error_of_an_unknown_processor_counts():
+    assert pocl_cpu.is_unknown_cpu("error: unknown target CPU 'generic'\nDevice x failed")
+    assert not pocl_cpu.is_unknown_cpu("error: use of undeclared identifier 'nonsense'")
