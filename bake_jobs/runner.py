@@ -239,7 +239,8 @@ def _run(
                 yield from (future.result() for future in finished)
         except BrokenProcessPool as error:
             raise WorkerLostError(
-                "a worker process was killed, most likely for want of memory; finished sectors are kept: start the same bake again with fewer --jobs"
+                "a worker process was killed, most likely for want of memory; finished sectors are kept: "
+                "start the same bake again with fewer --jobs"
             ) from error
         finally:
             pool.shutdown(wait=True, cancel_futures=True)

@@ -101,7 +101,7 @@ def test_an_array_that_does_not_fit_the_others_is_refused(make_sector, array, ch
     found = container.decode(sector_file.encode(make_sector(4), {}, PATCHES), KIND, VERSION, "here")
     arrays = dict(found.arrays)
     arrays[array] = change(arrays[array])
-    with pytest.raises(CorruptFileError, match="bad.gisec"):
+    with pytest.raises(CorruptFileError, match=r"bad\.gisec"):
         sector_file.decode(container.encode(KIND, VERSION, found.meta, arrays), "bad.gisec")
 
 
@@ -109,11 +109,11 @@ def test_a_missing_array_or_meta_is_refused(make_sector):
     found = container.decode(sector_file.encode(make_sector(4), {}, PATCHES), KIND, VERSION, "here")
     for name in found.arrays:
         rest = {key: value for key, value in found.arrays.items() if key != name}
-        with pytest.raises(CorruptFileError, match="bad.gisec"):
+        with pytest.raises(CorruptFileError, match=r"bad\.gisec"):
             sector_file.decode(container.encode(KIND, VERSION, found.meta, rest), "bad.gisec")
     for name in found.meta:
         rest = {key: value for key, value in found.meta.items() if key != name}
-        with pytest.raises(CorruptFileError, match="bad.gisec"):
+        with pytest.raises(CorruptFileError, match=r"bad\.gisec"):
             sector_file.decode(container.encode(KIND, VERSION, rest, found.arrays), "bad.gisec")
 
 
