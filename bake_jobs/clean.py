@@ -25,7 +25,8 @@ def clean_mesh(mesh: Mesh, where: str, rooms: tuple[Room, ...] = ()) -> tuple[Me
     """Drop what cannot be baked, merge equal vertices, turn inside-out solids; say what was dropped.
 
     Dropped are triangles with a NaN or infinite corner, colour or emission; with an index out of range or no area; and all but the
-    first of those with the same three corners, in any order, since surfaces are two-sided. The order of the rest is kept.
+    first of those with the same three corners in the same sense. Two that run in opposite senses are both kept: they are the walls
+    of two houses that touch, and each house is closed only with its own. The order of the rest is kept.
     Raises SourceError, naming ``where``, when nothing is left, or what is left is too large to be a city.
     """
     _refuse_too_many(len(mesh.triangles), where)
@@ -93,8 +94,9 @@ def _merge_equal(vertices: Float64, triangles: Int64) -> tuple[Float64, Int64]:
 
 
 def _first_of_equal(triangles: Int64) -> Bool:
-    """(m,) whether each triangle is the first with its corners, whatever their order."""
-    corners = np.sort(triangles, axis=1)
+    """(m,) whether each triangle is the first with its corners in its sense."""
+    lowest = np.argmin(triangles, axis=1)[:, None]
+    corners = np.take_along_axis(triangles, (lowest + np.arange(3)) % 3, axis=1)
     order = np.lexsort(corners.T)  # stable: equal ones stay in their order
     first = np.zeros(len(triangles), bool)
     first[order] = np.r_[True, (corners[order[1:]] != corners[order[:-1]]).any(axis=1)][: len(order)]

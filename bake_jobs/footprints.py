@@ -28,9 +28,6 @@ DEFAULT_HEIGHT_M = 3 * LEVEL_HEIGHT_M  # of a footprint that says nothing about 
 MAX_HEIGHT_M = 2000.0  # taller than any building; beyond it the unit is wrong
 MIN_PART_AREA_M2 = 0.05  # slivers that repair leaves behind
 FOUNDATION_M = 1.0  # how far walls go below the lowest ground near them, so that no gap opens
-# Neighbours share walls, and a ray through two walls in one place meets only one of them: whether it is then inside anything is a
-# guess. Each part grows by a few millimetres, other than the next ones' by more than a ray's step, so that walls overlap instead.
-GROWTH_STEP_M, GROWTH_STEPS = 0.003, 12
 MAX_POINTS = 20_000_000  # of all rings; a borough of New York is 1.2 million
 # Walls: brick, limestone, concrete, pale brick; each building takes one and scales it a little.
 WALL_PALETTE = ((0.42, 0.33, 0.28), (0.50, 0.47, 0.41), (0.42, 0.42, 0.42), (0.50, 0.44, 0.36), (0.36, 0.38, 0.41))
@@ -69,8 +66,6 @@ def load_footprints(path: Path, frame: MapFrame | None = None) -> SourceContent:
         )
     base = np.array([part.base for part in parts])[part_of]
     terrain = _terrain(polygons, np.array([part.building for part in parts])[part_of], base, low, high)
-    growth = GROWTH_STEP_M * (1 + np.arange(len(polygons)) % GROWTH_STEPS)
-    polygons = shapely.buffer(polygons, growth, join_style="mitre")
     meshes = _extrude(polygons, [parts[i] for i in part_of], terrain.lowest_below(low, high))
     location = Location(
         frame.latitude_degrees,

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from bake_jobs.config import BakeSettings
-from bake_jobs.inside import inside_solid
+from bake_jobs.inside import Solids
 from bake_jobs.rays import SURFACE_OFFSET_M, RayScene
 from bake_jobs.scene import ProbeHint
 from gi_core.arrays import Bool, Float64, UInt8, UInt16
@@ -23,6 +23,8 @@ MAX_LAYERS = 256
 # Flatter than this (cosine from the vertical) is a floor; steeper than WALL_MAX_UP is a wall.
 FLOOR_MIN_UP = 0.3
 WALL_MAX_UP = 0.5
+# A probe this close to a surface would see little else; it is pushed away from what stands at its side.
+CLEARANCE_M = 0.5
 # A wall probe closer than this to a probe that stands already would tell nothing new.
 WALL_MIN_DISTANCE_M = 3.0
 SAME_PLACE_M = 1.0
@@ -46,7 +48,13 @@ class Placement:
 
 
 def place_probes(
-    ray_scene: RayScene, bounds: Float64, index: SectorIndex, settings: BakeSettings, rooms: tuple[Room, ...], hints: tuple[ProbeHint, ...]
+    ray_scene: RayScene,
+    solids: Solids,
+    bounds: Float64,
+    index: SectorIndex,
+    settings: BakeSettings,
+    rooms: tuple[Room, ...],
+    hints: tuple[ProbeHint, ...],
 ) -> Placement:
     """Probes for a sector. ``bounds`` (2, 3) [m] are the whole scene's."""
     low = index.origin[[0, 2]] - settings.margin_m
@@ -61,7 +69,7 @@ def place_probes(
     position, flags = position[allowed], flags[allowed]
     room = room_of(position, rooms)
     # An authored room is air, whatever way its walls were modelled.
-    dead = inside_solid(ray_scene, position) & (room == ROOM_OUTDOORS)
+    dead = solids.contain(position) & (room == ROOM_OUTDOORS)
     position, flags, room = position[~dead], flags[~dead], room[~dead]
     kept = _thin(position, flags)
     position, flags, room = position[kept], flags[kept], room[kept]
@@ -126,6 +134,20 @@ def _ground_candidates(ray_scene: RayScene, bounds: Float64, low: Float64, high:
     height = np.minimum(settings.probe_height_m, free[roomy] / 2)
     position = at[roomy].copy()
     position[:, 1] += height
+    return _pushed_off(ray_scene, position)
+
+
+def _pushed_off(ray_scene: RayScene, position: Float64) -> Float64:
+    """Positions (n, 3) [m] moved sideways until CLEARANCE_M from what stands beside them, as far as there is room."""
+    # Lattice and walls share whole metres: a point in a wall's own plane is pulled to one side of it before it looks around.
+    position = position + np.array([0.011, 0.0, 0.007])
+    for azimuth in np.radians(np.arange(8) * 45.0):
+        direction = np.array([np.cos(azimuth), 0.0, np.sin(azimuth)])
+        ahead = ray_scene.closest(position, np.tile(direction.astype(np.float32), (len(position), 1)))
+        behind = ray_scene.closest(position, np.tile(-direction.astype(np.float32), (len(position), 1)))
+        push = np.maximum(CLEARANCE_M - ahead.distance, 0)
+        room = np.maximum(np.minimum(behind.distance, 1e6) - CLEARANCE_M, 0)
+        position = position - direction * np.minimum(push, room)[:, None]
     return position
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from bake_jobs import factors, gbuffer, placement, sun_visibility, surfels, voxels
 from bake_jobs.config import BakeSettings
 from bake_jobs.geometry_clip import SectorCutter
+from bake_jobs.inside import Solids
 from bake_jobs.rays import RayScene
 from bake_jobs.scene import Scene
 from gi_core import geometry_file, sector_file
@@ -40,6 +41,7 @@ class SectorBaker:
         self._sun_directions = sun_directions
         self._bake_id = bake_id
         self._rays = RayScene(scene.vertices, scene.triangles)
+        self._solids = Solids(scene.vertices, scene.triangles)
         self._cutter = SectorCutter(scene)
         self._pattern = gbuffer.cube_map_pattern(settings.rays_per_face_edge)
 
@@ -52,13 +54,13 @@ class SectorBaker:
     def bake_arrays(self, index: SectorIndex, geometry: Geometry) -> tuple[Sector, dict[str, Any]]:
         """One sector's arrays before quantisation, and its meta. ``geometry`` is what SectorCutter.cut gives for it."""
         scene, settings, rays = self._scene, self._settings, self._rays
-        placed = placement.place_probes(rays, scene.bounds, index, settings, scene.rooms, scene.hints)
+        placed = placement.place_probes(rays, self._solids, scene.bounds, index, settings, scene.rooms, scene.hints)
         seen = gbuffer.render(rays, placed.position, self._pattern)
         clustered = surfels.cluster(seen, index.origin, scene.albedo, scene.emission, settings.cells_double_beyond_m)
         weights = factors.gather(seen, self._pattern, clustered)
         feedback_probe, feedback_weight = surfels.feedback(clustered, seen, settings.feedback_probes)
         heights = geometry.vertices[:, 1] if len(geometry.vertices) else np.zeros(1)
-        lattice = voxels.bake_voxels(rays, np.array([heights.min(), heights.max()]), index, placed, settings, scene.rooms)
+        lattice = voxels.bake_voxels(rays, self._solids, np.array([heights.min(), heights.max()]), index, placed, settings, scene.rooms)
         emits = bool(clustered.emission.any())
         sector = Sector(
             index=index,

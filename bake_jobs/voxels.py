@@ -11,7 +11,7 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
 from bake_jobs.config import BakeSettings
-from bake_jobs.inside import inside_solid
+from bake_jobs.inside import Solids
 from bake_jobs.placement import Placement, room_of
 from bake_jobs.rays import SURFACE_OFFSET_M, RayScene
 from gi_core.arrays import Bool, Float32, Float64, Int32, Int64, UInt8, UInt16
@@ -40,7 +40,13 @@ class Voxels:
 
 
 def bake_voxels(
-    ray_scene: RayScene, surfaces: Float64, index: SectorIndex, placement: Placement, settings: BakeSettings, rooms: tuple[Room, ...]
+    ray_scene: RayScene,
+    solids: Solids,
+    surfaces: Float64,
+    index: SectorIndex,
+    placement: Placement,
+    settings: BakeSettings,
+    rooms: tuple[Room, ...],
 ) -> Voxels:
     """Voxels of a sector. ``surfaces`` (2,) [m] are the lowest and highest surface in it."""
     lattice, shape = _lattice(index, surfaces)
@@ -48,7 +54,7 @@ def bake_voxels(
     room = room_of(centre, rooms)
     kind = np.where(room == ROOM_OUTDOORS, VOXEL_OUTDOORS, VOXEL_INDOORS).astype(np.uint8)
     # An authored room is air, whatever way its walls were modelled.
-    kind[(room == ROOM_OUTDOORS) & _solid(ray_scene, centre.reshape(*shape, 3)).reshape(-1)] = VOXEL_SOLID
+    kind[(room == ROOM_OUTDOORS) & _solid(ray_scene, solids, centre.reshape(*shape, 3)).reshape(-1)] = VOXEL_SOLID
     probe, weight, blind = _blend(ray_scene, centre, kind, room, placement, settings)
     source = _nearest_air(kind.reshape(shape))
     probe, weight = probe[source], weight[source]
@@ -77,7 +83,7 @@ def _lattice(index: SectorIndex, surfaces: Float64) -> tuple[Int64, tuple[int, i
     return np.stack([x, y, z], axis=-1), (len(ranges[0]), len(ranges[1]), len(ranges[2]))
 
 
-def _solid(ray_scene: RayScene, centre: Float64) -> Bool:
+def _solid(ray_scene: RayScene, solids: Solids, centre: Float64) -> Bool:
     """(ny, nz, nx) bool: which voxel centres (ny, nz, nx, 3) lie in a solid.
 
     Voxels of a column with nothing between them are alike, so one of each run is tested: a seventh of them, in midtown.
@@ -88,7 +94,7 @@ def _solid(ray_scene: RayScene, centre: Float64) -> Bool:
     cut = ray_scene.occluded(below, up, np.full(len(below), VOXEL_SIZE_M)).reshape(ny - 1, nz, nx)
     run_in_column = np.concatenate([np.zeros((1, nz, nx), np.int64), np.cumsum(cut, axis=0)])
     _, first, of_voxel = np.unique(run_in_column + ny * np.arange(nz * nx).reshape(nz, nx), return_index=True, return_inverse=True)
-    return inside_solid(ray_scene, centre.reshape(-1, 3)[first])[of_voxel.reshape(ny, nz, nx)]
+    return solids.contain(centre.reshape(-1, 3)[first])[of_voxel.reshape(ny, nz, nx)]
 
 
 def _blend(

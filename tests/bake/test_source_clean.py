@@ -42,14 +42,21 @@ def test_each_defect_is_dropped_and_counted_once():
         [3, 3, 5],  # a point twice
         [0, 10, 11],  # three in a line
         [*good.triangles[0][[1, 2, 0]]],  # the first triangle, turned
-        [*good.triangles[1][::-1]],  # the second, seen from behind
         [12 if corner == 7 else corner for corner in good.triangles[3]],  # the fourth, over a vertex stored twice
     ]
     mesh, dropped = clean_mesh(Mesh.of_colour(vertices, np.concatenate([good.triangles, bad]), (0.5, 0.5, 0.5)), "dirty")
     assert 7 in good.triangles[3], "the case above needs corner 7"
-    assert (dropped.non_finite, dropped.degenerate, dropped.duplicate) == (2, 4, 3)
+    assert (dropped.non_finite, dropped.degenerate, dropped.duplicate) == (2, 4, 2)
     assert len(mesh.triangles) == 12
     assert volume(mesh) == pytest.approx(1)
+
+
+def test_walls_of_two_houses_that_touch_are_both_kept():
+    good = box_mesh()
+    behind = good.triangles[1][::-1][None]
+    mesh, dropped = clean_mesh(Mesh.of_colour(good.vertices, np.concatenate([good.triangles, behind]), (0.5, 0.5, 0.5)), "row")
+    assert dropped.duplicate == 0
+    assert len(mesh.triangles) == 13
 
 
 @pytest.mark.parametrize("offset", [0.0, 5e4, -4e5])
