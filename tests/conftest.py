@@ -1,10 +1,17 @@
 """What several test folders share: the folder of real cities, random sectors, built scenes."""
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from bake_jobs.config import settings_for
+from bake_jobs.geometry_clip import SectorCutter
+from bake_jobs.scene import Scene
+from bake_jobs.sector_job import SectorBaker
+from bake_jobs.solids import boxes
 from gi_core.grid import SectorIndex
 from gi_core.sector import Sector, starts
 
@@ -95,3 +102,66 @@ def _clean_bits(rng: np.random.Generator, planes: int, surfels: int) -> np.ndarr
 @pytest.fixture(scope="session")
 def make_sector():
     return random_sector
+
+
+BOX_FACES = ("-x", "+x", "-y", "+y", "-z", "+z")  # the order of bake_jobs.solids.boxes, two triangles each
+
+
+class SceneBuilder:
+    """Collects flat pieces into a Scene. Colours are a number or a triple; metres, world frame."""
+
+    def __init__(self, offset: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
+        """Everything is moved by ``offset`` [m]."""
+        self._offset = np.asarray(offset, np.float64)
+        self._parts: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
+
+    def add(self, vertices, triangles, albedo=0.5, emission=0.0) -> "SceneBuilder":
+        colours = [np.broadcast_to(np.asarray(c, np.float32), (len(triangles), 3)) for c in (albedo, emission)]
+        self._parts.append((np.asarray(vertices, np.float64) + self._offset, np.asarray(triangles), *colours))
+        return self
+
+    def quad(self, corner, edge_a, edge_b, albedo=0.5, emission=0.0) -> "SceneBuilder":
+        """A parallelogram whose front is the side of edge_a x edge_b."""
+        corner, edge_a, edge_b = (np.asarray(v, np.float64) for v in (corner, edge_a, edge_b))
+        corners = [corner, corner + edge_a, corner + edge_a + edge_b, corner + edge_b]
+        return self.add(corners, [[0, 1, 2], [0, 2, 3]], albedo, emission)
+
+    def ground(self, low=(-128.0, -128.0), high=(192.0, 192.0), y=0.0, albedo=0.5) -> "SceneBuilder":
+        """A level rectangle that faces up; low and high are (x, z)."""
+        return self.quad((low[0], y, low[1]), (0, 0, high[1] - low[1]), (high[0] - low[0], 0, 0), albedo)
+
+    def box(self, low, high, albedo=0.5, emission=0.0, without=(), inward=False) -> "SceneBuilder":
+        """A box; ``without`` names faces that it lacks, ``inward`` turns it inside out (a room)."""
+        vertices, triangles = boxes(np.asarray(low, np.float64), np.asarray(high, np.float64))
+        kept = np.repeat([face not in without for face in BOX_FACES], 2)
+        return self.add(vertices, triangles[kept][:, ::-1] if inward else triangles[kept], albedo, emission)
+
+    def scene(self, **fields) -> Scene:
+        first = np.cumsum([0, *(len(v) for v, _, _, _ in self._parts)])
+        return Scene(
+            np.concatenate([v for v, _, _, _ in self._parts]),
+            np.concatenate([t + f for (_, t, _, _), f in zip(self._parts, first, strict=False)]).astype(np.int32),
+            np.concatenate([a for _, _, a, _ in self._parts]).astype(np.float32),
+            np.concatenate([e for _, _, _, e in self._parts]).astype(np.float32),
+            **fields,
+        )
+
+
+@pytest.fixture(scope="session")
+def build() -> type[SceneBuilder]:
+    return SceneBuilder
+
+
+STRAIGHT_UP = np.array([[0.0, 1.0, 0.0]])
+
+
+def bake_sector_arrays(scene, index=(0, 0), sun_directions=STRAIGHT_UP, **settings):
+    """One sector of a scene, baked with the talk's settings but for those given: (Sector before quantisation, meta)."""
+    baker = SectorBaker(scene, replace(settings_for("talk"), **settings), np.asarray(sun_directions), "test")
+    index = SectorIndex(*index)
+    return baker.bake_arrays(index, SectorCutter(scene).cut(index))
+
+
+@pytest.fixture(scope="session")
+def bake_arrays():
+    return bake_sector_arrays
