@@ -21,7 +21,10 @@ STEP_M = 0.001
 # Straight up, four ways steeply, four ways nearly level. Turned away from the axes, since walls run along them and a ray in a wall's
 # plane crosses it by luck.
 _AZIMUTHS = np.radians([17.0, 107.0, 197.0, 287.0])
-_ELEVATIONS = np.radians([58.0, 13.0])
+_ELEVATIONS = np.radians([58.0, 5.0])
+# The upward and the four steep rays under a canopy that is a mere sheet leave it as they would leave a solid; a level ray tells them
+# apart. In real cities nearly every point gets at most two votes or at least seven.
+VOTES_FOR_SOLID = 7
 # Multiples of the golden ratio's fraction spread evenly, and no two near indices come close.
 _GOLDEN = 0.6180339887498949
 
@@ -52,14 +55,14 @@ class Solids:
         self._rays = RayScene(moved.reshape(-1, 3), np.arange(3 * len(triangles), dtype=np.int32).reshape(-1, 3))
 
     def contain(self, points: Float64) -> Bool:
-        """(n,) bool for points (n, 3) [m], world frame: most rays leave more surfaces than they enter."""
+        """(n,) bool for points (n, 3) [m], world frame: VOTES_FOR_SOLID of nine rays leave more surfaces than they enter."""
         inside = np.zeros(len(points), bool)
         # Most air sees straight up, and is done after one ray.
         up = np.tile(np.array([[0, 1, 0]], np.float32), (len(points), 1))
         unsure = np.flatnonzero(self._rays.occluded(points, up))
         rays = len(VOTING_DIRECTIONS)
         net = self.net_exits(np.repeat(points[unsure], rays, axis=0), np.tile(VOTING_DIRECTIONS, (len(unsure), 1)))
-        inside[unsure] = (net.reshape(-1, rays) > 0).sum(axis=1) > rays // 2
+        inside[unsure] = (net.reshape(-1, rays) > 0).sum(axis=1) >= VOTES_FOR_SOLID
         return inside
 
     def net_exits(self, origins: Float64, directions: Float32) -> Int64:

@@ -32,7 +32,7 @@ SAME_PLACE_M = 1.0
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """Probes of one sector, those that matter most first.
+    """Probes of one sector and of the margin around it.
 
     position : (P, 3) float64 [m], world frame
     flags : (P,) uint8, bits of gi_core.sector
@@ -57,8 +57,9 @@ def place_probes(
     hints: tuple[ProbeHint, ...],
 ) -> Placement:
     """Probes for a sector. ``bounds`` (2, 3) [m] are the whole scene's."""
-    low = index.origin[[0, 2]] - settings.margin_m
-    high = index.origin[[0, 2]] + SECTOR_SIZE_M + settings.margin_m
+    # Candidates come from further out than the margin: what thins its probes must stand there too, as it does for the neighbour.
+    reach = settings.margin_m + WALL_MIN_DISTANCE_M
+    low, high = index.origin[[0, 2]] - reach, index.origin[[0, 2]] + SECTOR_SIZE_M + reach
     ground = _ground_candidates(ray_scene, bounds, low, high, settings)
     wall = _wall_candidates(ray_scene, bounds, low, high, settings)
     asked = _asked_candidates(hints, low, high)
@@ -70,12 +71,12 @@ def place_probes(
     room = room_of(position, rooms)
     # An authored room is air, whatever way its walls were modelled.
     dead = solids.contain(position) & (room == ROOM_OUTDOORS)
+    dead_count = int((dead & _in_sector(position, index, settings.margin_m)).sum())
     position, flags, room = position[~dead], flags[~dead], room[~dead]
-    kept = _thin(position, flags)
+    kept = _thin(ray_scene, position, flags) & _in_sector(position, index, settings.margin_m)
     position, flags, room = position[kept], flags[kept], room[kept]
 
-    origin = index.origin[[0, 2]]
-    in_sector = ((position[:, [0, 2]] >= origin) & (position[:, [0, 2]] < origin + SECTOR_SIZE_M)).all(axis=1)
+    in_sector = _in_sector(position, index, 0.0)
     flags = np.where(in_sector, flags, flags | PROBE_IN_MARGIN).astype(np.uint8)
     # Within its own sector first, the ground before walls, low before high; then a fixed order of place.
     order = np.lexsort((position[:, 0], position[:, 2], position[:, 1], flags & PROBE_ON_WALL, flags & PROBE_IN_MARGIN))
@@ -83,7 +84,7 @@ def place_probes(
     position, flags, room = position[chosen], flags[chosen], room[chosen]
     # Stored along a curve of place, so that neighbours in memory are neighbours in space: their factors compress and cache well.
     order = np.lexsort((position[:, 1], position[:, 0] // 8, position[:, 2] // 8))
-    return Placement(position[order], flags[order], room[order], int(dead.sum()), max(0, len(in_sector) - MAX_PROBES_PER_SECTOR))
+    return Placement(position[order], flags[order], room[order], dead_count, max(0, len(in_sector) - MAX_PROBES_PER_SECTOR))
 
 
 def room_of(position: Float64, rooms: tuple[Room, ...]) -> UInt16:
@@ -93,6 +94,12 @@ def room_of(position: Float64, rooms: tuple[Room, ...]) -> UInt16:
         box = rooms[number - 1]
         room[((position >= box.minimum) & (position <= box.maximum)).all(axis=1)] = number
     return room
+
+
+def _in_sector(position: Float64, index: SectorIndex, margin_m: float) -> Bool:
+    """(n,) bool: which positions lie in the sector's column, widened by a margin [m]."""
+    local = position[:, [0, 2]] - index.origin[[0, 2]]
+    return np.asarray(((local >= -margin_m) & (local < SECTOR_SIZE_M + margin_m)).all(axis=1), np.bool_)
 
 
 def _lattice(low: float, high: float, spacing: float) -> Float64:
@@ -182,8 +189,9 @@ def _wall_candidates(ray_scene: RayScene, bounds: Float64, low: Float64, high: F
     offset = np.minimum(settings.wall_offset_m, np.minimum(air.distance, 1e6) / 2)
     fits = offset > 0.3
     position = at[fits] + normal[fits] * offset[fits, None]
-    inside = ((position[:, [0, 2]] >= low) & (position[:, [0, 2]] < high)).all(axis=1)
-    return position[inside]
+    # In an order of place, not of the rays, which start elsewhere for every sector. To the centimetre: rays are rounded.
+    order = np.lexsort(np.round(position * 100).T[[0, 2, 1]])
+    return position[order]
 
 
 def _asked_candidates(hints: tuple[ProbeHint, ...], low: Float64, high: Float64) -> Float64:
@@ -206,15 +214,18 @@ def _in_boxes(position: Float64, boxes: list[ProbeHint]) -> Bool:
     return inside
 
 
-def _thin(position: Float64, flags: UInt8) -> Bool:
-    """Which probes stay: none stands in the place of an earlier one, no wall probe stands close to any."""
+def _thin(ray_scene: RayScene, position: Float64, flags: UInt8) -> Bool:
+    """Which probes stay: none stands in the place of an earlier one, no wall probe close to any that it sees."""
     kept = np.ones(len(position), bool)
     if len(position) < 2:
         return kept
     near = cKDTree(position).query_pairs(WALL_MIN_DISTANCE_M, output_type="ndarray")
     near = near[np.lexsort((near[:, 0], near[:, 1]))]
-    distance = np.linalg.norm(position[near[:, 0]] - position[near[:, 1]], axis=1)
+    offset = position[near[:, 1]] - position[near[:, 0]]
+    distance = np.linalg.norm(offset, axis=1)
     too_close = distance < np.where(flags[near[:, 1]] & PROBE_ON_WALL, WALL_MIN_DISTANCE_M, SAME_PLACE_M)
+    # Two probes with a thin wall between them stand in different light.
+    too_close &= ~ray_scene.occluded(position[near[:, 0]], offset / np.maximum(distance, 1e-6)[:, None], distance)
     for earlier, later in near[too_close]:
         if kept[earlier]:
             kept[later] = False
