@@ -29,7 +29,7 @@ from bake_jobs.scene import Scene, scene_digest
 from bake_jobs.scene_source import load_scene
 from bake_jobs.sector_job import SKY_FACES, SectorBaker
 from bake_jobs.summary import print_summary
-from gi_core import distant_file, sector_file
+from gi_core import distant_file, geometry_file, sector_file
 from gi_core.container import write_atomic
 from gi_core.dataset import DISTANT_FILE, WORLD_FILE, SectorFacts, WorldInfo, geometry_path, sector_path, write_world
 from gi_core.errors import FormatError, InputError, SectorlightError
@@ -37,7 +37,7 @@ from gi_core.grid import SectorIndex
 from gi_core.sun_table import SunTable
 
 # Part of the bake id: raised whenever the same settings would give other bytes than before.
-BAKER_VERSION = 1
+BAKER_VERSION = 2
 SectorRange = tuple[tuple[int, int], tuple[int, int]]
 
 
@@ -104,7 +104,8 @@ def bake(
                 done[finished.index] = finished
                 progress.advance(task)
     wall_seconds = time.perf_counter() - started
-    write_atomic(output / DISTANT_FILE, distant_file.encode(distant_file.assemble({i: f.distant_sky for i, f in done.items()})))
+    texels = distant_file.assemble({i: f.distant_sky for i, f in done.items()})
+    write_atomic(output / DISTANT_FILE, distant_file.encode(texels, bake_id))
     world = WorldInfo(
         name=scene.name,
         source=Path(source).name if Path(source).exists() else source,
@@ -175,7 +176,8 @@ def _finished(output: Path, index: SectorIndex, bake_id: str) -> _Finished | Non
     data = path.read_bytes()
     try:
         sector, meta = sector_file.decode(data, str(path))
-        if sector.index != index or meta["bake_id"] != bake_id:
+        _, cut, cut_id = geometry_file.read(geometry)
+        if {sector.index, cut} != {index} or {meta["bake_id"], cut_id} != {bake_id}:
             return None
         return _Finished(index, _facts(data, geometry.stat().st_size, meta), meta["distant_sky"], 0.0)
     except (FormatError, KeyError, TypeError, ValueError):

@@ -49,7 +49,7 @@ class SectorBaker:
         """Both files of one sector."""
         geometry = self._cutter.cut(index)
         sector, meta = self.bake_arrays(index, geometry)
-        return BakedSector(index, sector_file.encode(sector, meta, SKY_FACES), geometry_file.encode(index, geometry), meta)
+        return BakedSector(index, sector_file.encode(sector, meta, SKY_FACES), geometry_file.encode(index, geometry, self._bake_id), meta)
 
     def bake_arrays(self, index: SectorIndex, geometry: Geometry) -> tuple[Sector, dict[str, Any]]:
         """One sector's arrays before quantisation, and its meta. ``geometry`` is what SectorCutter.cut gives for it."""

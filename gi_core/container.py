@@ -29,6 +29,7 @@ _DTYPES = ("u1", "u2", "u4", "i2", "i4", "f2", "f4")
 MAX_RAW_BYTES = 1 << 28
 MAX_HEADER_BYTES = 1 << 20
 MAX_ARRAYS = 64
+MAX_FILE_BYTES = PREFIX_BYTES + MAX_HEADER_BYTES + MAX_RAW_BYTES
 # Higher levels save 3 % more and take three times as long.
 ZSTD_LEVEL = 12
 
@@ -94,19 +95,23 @@ def decode(data: bytes, kind: str, version: int, where: str) -> Container:
         raise CorruptFileError(f"{where}: checksum differs: the file was altered or damaged; bake it again")
     try:
         parsed = json.loads(header)
-        raw = zstandard.ZstdDecompressor().decompress(payload, max_output_size=raw_bytes) if raw_bytes else b""
+        # The frame's own size is what the decompressor allocates, whatever it is told.
+        if zstandard.frame_content_size(payload) != raw_bytes:
+            raise CorruptFileError(f"{where}: expected one zstd frame of {raw_bytes} bytes; bake it again")
+        raw = zstandard.ZstdDecompressor().decompress(payload, allow_extra_data=False) if raw_bytes else b""
         return Container(parsed["meta"], _read_arrays(parsed["arrays"], raw, raw_bytes, where))
-    except (zstandard.ZstdError, ValueError, KeyError, TypeError) as error:
+    except (zstandard.ZstdError, ValueError, KeyError, TypeError, RecursionError) as error:
         if isinstance(error, CorruptFileError):
             raise
         raise CorruptFileError(f"{where}: {error}; bake it again") from error
 
 
-def read(path: Path, kind: str, version: int) -> Container:
-    """Contents of a container file. Raises as ``decode`` does, and FileNotFoundError."""
-    if path.stat().st_size > MAX_RAW_BYTES:
-        raise CorruptFileError(f"{path}: {path.stat().st_size} bytes, expected at most {MAX_RAW_BYTES}")
-    return decode(path.read_bytes(), kind, version, str(path))
+def read_bytes(path: Path, most: int = MAX_FILE_BYTES) -> bytes:
+    """A file's bytes. Raises CorruptFileError for one of more than ``most`` bytes, before it is read, and OSError."""
+    size = path.stat().st_size
+    if size > most:
+        raise CorruptFileError(f"{path}: expected at most {most} bytes, found {size}; bake it again")
+    return path.read_bytes()
 
 
 def write_atomic(path: Path, data: bytes) -> None:
@@ -162,6 +167,9 @@ def _read_arrays(table: list[dict[str, Any]], raw: bytes, raw_bytes: int, where:
             raise CorruptFileError(f"{where}: array {name!r} has shape {shape!r}")
         dtype = np.dtype("<" + code)
         size = math.prod(shape) * dtype.itemsize
+        # An axis of length 0 must not hide lengths that what is computed from the array would have.
+        if math.prod(max(n, 1) for n in shape) > MAX_RAW_BYTES:
+            raise CorruptFileError(f"{where}: array {name!r} has shape {shape!r}")
         if offset + size > raw_bytes:
             raise CorruptFileError(f"{where}: array {name!r} ends beyond the data")
         arrays[name] = _unpack(raw[offset : offset + size], dtype, tuple(shape), delta)

@@ -3,7 +3,7 @@ servers share. FORMAT.md describes it."""
 
 import hashlib
 import json
-import math
+import re
 from dataclasses import asdict, dataclass
 from datetime import date
 from pathlib import Path
@@ -13,10 +13,13 @@ import numpy as np
 
 from gi_core import container, distant_file, geometry_file, sector_file
 from gi_core.arrays import Float64
+from gi_core.clock_time import time_zone
+from gi_core.constants import CUBE_FACES
 from gi_core.distant_file import DistantTexels
 from gi_core.errors import CorruptFileError, FormatVersionError, InputError, SectorMissingError
 from gi_core.geometry_file import Geometry
 from gi_core.grid import SectorIndex
+from gi_core.json_fields import Fields, all_finite
 from gi_core.sector import Sector
 from gi_core.sun_table import SunTable
 from gi_core.world import Lamp, Location, Room
@@ -28,6 +31,12 @@ DISTANT_FILE = "distant.gidist"
 MAX_WORLD_BYTES = 1 << 28
 # 62 500 km2 of city; a reader refuses more before it makes room for it.
 MAX_SECTORS = 1 << 24
+# 64 000 km from the origin.
+MAX_SECTOR_COORDINATE = 1_000_000
+# Room numbers have 16 bits, and 0 is outdoors.
+MAX_ROOMS = 65_535
+MAX_LAMPS = 1 << 20
+BASES = ("cube",)
 
 
 @dataclass(frozen=True)
@@ -106,54 +115,107 @@ class WorldInfo:
 
     @classmethod
     def from_json(cls, record: Any, where: str) -> "WorldInfo":
-        """The inverse of to_json. Raises InputError for what is no world.json, FormatVersionError for another version's."""
+        """The inverse of to_json; ``where`` names the file in errors.
+
+        Raises InputError for what is no world.json, FormatVersionError for another version's, CorruptFileError for anything in it that
+        is missing, unknown, of another type or out of its range.
+        """
         if not isinstance(record, dict) or record.get("format") != FORMAT:
             raise InputError(f"{where}: not a Sectorlight dataset; `sectorlight bake` makes one")
-        if record.get("version") != VERSION:
+        found = record.get("version")
+        if isinstance(found, bool) or not isinstance(found, int) or not 0 <= found < 1 << 32:
+            raise CorruptFileError(f"{where}: expected the version to be a whole number, found a {type(found).__name__}; bake it again")
+        if found != VERSION:
             raise FormatVersionError(
-                f"{where}: dataset version {record.get('version')!r}, this program reads version {VERSION}; bake it again with this program"
+                f"{where}: dataset version {found}, this program reads version {VERSION}; bake it again with this program"
             )
-        try:
-            sectors = {}
-            for key, facts in record["sectors"].items():
-                x, z = key.split(",")
-                sectors[SectorIndex(int(x), int(z))] = SectorFacts(**facts)
-            bounds = np.array(record["bounds"], np.float64)
-            if len(sectors) > MAX_SECTORS or bounds.shape != (2, 3) or not np.isfinite(bounds).all():
-                raise ValueError("bounds or sectors out of range")
-            location = dict(record["location"])
-            location["date"] = date.fromisoformat(location["date"])
-            return cls(
-                name=str(record["name"]),
-                source=str(record["source"]),
-                bake_id=str(record["bake_id"]),
-                location=Location(**location),
-                bounds=bounds,
-                preset=str(record["preset"]),
-                basis=str(record["basis"]),
-                sky_patches=int(record["sky_patches"]),
-                settings=dict(record["settings"]),
-                seed=int(record["seed"]),
-                sun_table=SunTable.from_json(record["sun_table"]),
-                sectors=sectors,
-                rooms=tuple(Room(r["name"], _point(r["minimum"]), _point(r["maximum"])) for r in record["rooms"]),
-                lamps=tuple(_lamp(lamp) for lamp in record["lamps"]),
-                dropped_triangles={str(k): int(v) for k, v in record["dropped_triangles"].items()},
-                error_report=record["error_report"],
-            )
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise CorruptFileError(f"{where}: {type(error).__name__}: {error}; bake it again") from error
+        top = Fields(record, where, _TOP_LEVEL)
+        low, high = _corners(top)
+        report = None if record["error_report"] is None else top.mapping("error_report")
+        if not all_finite([report, top.mapping("settings")]):
+            raise CorruptFileError(f"{where}: settings or error_report hold a number or a text that JSON has no place for; bake it again")
+        if report is not None and "expected_error" in report:
+            top.fields("error_report").number("expected_error")
+        return cls(
+            name=top.text("name"),
+            source=top.text("source"),
+            bake_id=top.text("bake_id"),
+            location=_location(top.fields("location", Location.__dataclass_fields__)),
+            bounds=np.array([low, high], np.float64),
+            preset=top.text("preset"),
+            basis=top.choice("basis", BASES),
+            # Sky patches are the cube's faces: what other numbers stand for, this version does not say.
+            sky_patches=top.integer("sky_patches", len(CUBE_FACES), len(CUBE_FACES)),
+            settings=top.mapping("settings"),
+            seed=top.integer("seed"),
+            sun_table=SunTable.from_json(record["sun_table"]),
+            sectors=_sectors(top),
+            rooms=tuple(_room(Fields(r, f"{where}: rooms", Room.__dataclass_fields__)) for r in top.sequence("rooms", MAX_ROOMS)),
+            lamps=tuple(_lamp(Fields(r, f"{where}: lamps", Lamp.__dataclass_fields__)) for r in top.sequence("lamps", MAX_LAMPS)),
+            dropped_triangles={name: top.fields("dropped_triangles").integer(name) for name in top.mapping("dropped_triangles")},
+            error_report=report,
+        )
 
 
-def _point(values: Any) -> tuple[float, float, float]:
-    x, y, z = (float(v) for v in values)
-    if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z)):
-        raise ValueError("a position is not finite")
-    return x, y, z
+_TOP_LEVEL = frozenset(WorldInfo.__dataclass_fields__) | {"format", "version"}
+_SECTOR_KEY = re.compile(r"(-?\d{1,7}),(-?\d{1,7})", re.ASCII)
 
 
-def _lamp(record: dict[str, Any]) -> Lamp:
-    return Lamp(**record | {"position": _point(record["position"]), "color": _point(record["color"])})
+def _sectors(top: Fields) -> dict[SectorIndex, SectorFacts]:
+    records = top.mapping("sectors")
+    if len(records) > MAX_SECTORS:
+        raise CorruptFileError(f"{top.where}: expected at most {MAX_SECTORS} sectors, found {len(records)}; bake it again")
+    sectors = {}
+    for key, record in records.items():
+        match = _SECTOR_KEY.fullmatch(key)
+        # One spelling for each sector: neither 01,0 nor -0,0.
+        if match is None or f"{int(match[1])},{int(match[2])}" != key or max(abs(int(n)) for n in match.groups()) > MAX_SECTOR_COORDINATE:
+            raise CorruptFileError(f"{top.where}: sectors: expected keys such as 3,-2, found {key[:40]!a}; bake it again")
+        facts = Fields(record, f"{top.where}: sectors: {key}", SectorFacts.__dataclass_fields__)
+        counted = {name: facts.integer(name) for name in SectorFacts.__dataclass_fields__ if name != "digest"}
+        sectors[SectorIndex(int(match[1]), int(match[2]))] = SectorFacts(digest=facts.text("digest"), **counted)
+    return sectors
+
+
+def _corners(top: Fields) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    corners = [Fields({"bounds": corner}, top.where).point("bounds") for corner in top.sequence("bounds", 2)]
+    if len(corners) != 2 or any(low > high for low, high in zip(*corners, strict=True)):
+        raise CorruptFileError(f"{top.where}: bounds: expected a minimum and a maximum, found {corners}; bake it again")
+    return corners[0], corners[1]
+
+
+def _location(place: Fields) -> Location:
+    try:
+        day, zone = date.fromisoformat(place.text("date")), place.text("timezone")
+        time_zone(zone)
+    except ValueError as error:
+        if isinstance(error, CorruptFileError):
+            raise
+        raise CorruptFileError(f"{place.where}: {error}; bake it again") from error
+    return Location(
+        latitude_degrees=place.number("latitude_degrees", -90, 90),
+        longitude_degrees=place.number("longitude_degrees", -180, 180),
+        elevation_m=place.number("elevation_m"),
+        timezone=zone,
+        north_degrees=place.number("north_degrees"),
+        date=day,
+        source=place.text("source"),
+    )
+
+
+def _room(room: Fields) -> Room:
+    return Room(room.text("name"), room.point("minimum"), room.point("maximum"))
+
+
+def _lamp(lamp: Fields) -> Lamp:
+    return Lamp(
+        name=lamp.text("name"),
+        kind=lamp.text("kind"),
+        position=lamp.point("position"),
+        lumens=lamp.number("lumens", 0, 1e12),
+        color=lamp.point("color", 0),
+        range_m=lamp.number("range_m", 0),
+    )
 
 
 def sector_path(root: Path, index: SectorIndex) -> Path:
@@ -183,12 +245,14 @@ class Dataset:
             raise InputError(
                 f"{root}: no {WORLD_FILE} here; expected a folder that `sectorlight bake` wrote (a bake that was cut off resumes)"
             )
-        if file.stat().st_size > MAX_WORLD_BYTES:
-            raise CorruptFileError(f"{file}: {file.stat().st_size} bytes, expected at most {MAX_WORLD_BYTES}")
-        text = file.read_bytes()
         try:
+            text = container.read_bytes(file, MAX_WORLD_BYTES)
             record = json.loads(text)
-        except ValueError as error:
+        except OSError as error:
+            raise InputError(f"{file}: {error.strerror}") from error
+        except CorruptFileError:
+            raise
+        except (ValueError, RecursionError) as error:
             raise CorruptFileError(f"{file}: {error}; bake it again") from error
         return cls(root, WorldInfo.from_json(record, str(file)), hashlib.blake2b(text, digest_size=16).hexdigest())
 
@@ -206,11 +270,14 @@ class Dataset:
             raise CorruptFileError(f"{path}: {error.strerror}; bake it again") from error
         world = self.world
         if sector.index != index or meta.get("bake_id") != world.bake_id:
-            raise CorruptFileError(f"{path}: holds sector {sector.index} of another bake; bake it again")
+            raise CorruptFileError(f"{path}: holds sector {sector.index}{_other_bake(meta.get('bake_id'), world)}; bake it again")
         if len(sector.sun_visibility) != world.sun_table.plane_count:
             raise CorruptFileError(
                 f"{path}: {len(sector.sun_visibility)} sun planes, expected {world.sun_table.plane_count}; bake it again"
             )
+        # The device holds as many patches as world.json says; the file was checked against its own number.
+        if int(sector.factor_source.max(initial=0)) >= sector.brick_count + world.sky_patches:
+            raise CorruptFileError(f"{path}: expected factors of {world.sky_patches} sky patches at most; bake it again")
         return sector
 
     def geometry(self, index: SectorIndex) -> Geometry:
@@ -218,21 +285,33 @@ class Dataset:
         self._expect(index)
         path = geometry_path(self.path, index)
         try:
-            return geometry_file.read(path)
+            geometry, found, bake_id = geometry_file.read(path)
         except OSError as error:
             raise CorruptFileError(f"{path}: {error.strerror}; bake it again") from error
+        if found != index or bake_id != self.world.bake_id:
+            raise CorruptFileError(f"{path}: holds sector {found}{_other_bake(bake_id, self.world)}; bake it again")
+        return geometry
 
     def distant(self) -> DistantTexels:
         """Sky factors of all sectors' distant texels. Raises CorruptFileError."""
         path = self.path / DISTANT_FILE
         try:
-            return distant_file.read(path)
+            texels, bake_id = distant_file.read(path)
         except OSError as error:
             raise CorruptFileError(f"{path}: {error.strerror}; bake it again") from error
+        rows, columns = np.nonzero(texels.valid)
+        found = {SectorIndex(texels.origin.x + x, texels.origin.z + z) for z, x in zip(rows.tolist(), columns.tolist(), strict=True)}
+        if bake_id != self.world.bake_id or found != set(self.world.sectors):
+            raise CorruptFileError(f"{path}: holds {len(found)} sectors{_other_bake(bake_id, self.world)}; bake it again")
+        return texels
 
     def _expect(self, index: SectorIndex) -> None:
         if index not in self.world.sectors:
             raise SectorMissingError(f"{self.path}: sector {index.x},{index.z} is not in this dataset of {len(self.world.sectors)} sectors")
+
+
+def _other_bake(bake_id: Any, world: WorldInfo) -> str:
+    return "" if bake_id == world.bake_id else " of another bake"
 
 
 def write_world(root: Path, world: WorldInfo) -> None:

@@ -42,24 +42,28 @@ def assemble(texels: dict[SectorIndex, list[float]]) -> DistantTexels:
     return DistantTexels(origin, sky, valid)
 
 
-def encode(texels: DistantTexels) -> bytes:
-    """Bytes of a distant file."""
-    return container.encode(KIND, VERSION, {"origin": list(texels.origin)}, {"sky": texels.sky.astype(np.float32), "valid": texels.valid})
+def encode(texels: DistantTexels, bake_id: str) -> bytes:
+    """Bytes of a distant file. ``bake_id`` names the bake, as in the sectors' files."""
+    meta = {"origin": list(texels.origin), "bake_id": bake_id}
+    return container.encode(KIND, VERSION, meta, {"sky": texels.sky.astype(np.float32), "valid": texels.valid})
 
 
-def decode(data: bytes, where: str) -> DistantTexels:
-    """Texels of a distant file. Raises CorruptFileError or FormatVersionError."""
+def decode(data: bytes, where: str) -> tuple[DistantTexels, str]:
+    """Texels of a distant file, and their bake's id. Raises CorruptFileError or FormatVersionError."""
     found = container.decode(data, KIND, VERSION, where)
-    sky, valid = found.take("sky", "f4", 3), found.take("valid", "u1", 2)
-    if sky.shape != (*valid.shape, 6) or not np.isfinite(sky).all():
-        raise CorruptFileError(f"{where}: expected six finite sky factors per texel, found {sky.shape}; bake it again")
     try:
-        origin = SectorIndex(*(int(v) for v in found.meta["origin"]))
-    except (KeyError, TypeError, ValueError) as error:
-        raise CorruptFileError(f"{where}: no origin ({error}); bake it again") from error
-    return DistantTexels(origin, sky, valid)
+        sky, valid = found.take("sky", "f4", 3), found.take("valid", "u1", 2)
+        origin, bake_id = SectorIndex(*(int(v) for v in found.meta["origin"])), str(found.meta["bake_id"])
+    except CorruptFileError as error:
+        raise CorruptFileError(f"{where}: {error}; bake it again") from error
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise CorruptFileError(f"{where}: no origin or bake id ({error}); bake it again") from error
+    # A NaN is in no range.
+    if sky.shape != (*valid.shape, 6) or not ((sky >= 0) & (sky <= 1.001)).all() or valid.max(initial=0) > 1:
+        raise CorruptFileError(f"{where}: expected six sky factors of 0..1 per texel, found {sky.shape}; bake it again")
+    return DistantTexels(origin, sky, valid), bake_id
 
 
-def read(path: Path) -> DistantTexels:
+def read(path: Path) -> tuple[DistantTexels, str]:
     """A distant file from disk, as ``decode``."""
-    return decode(path.read_bytes(), str(path))
+    return decode(container.read_bytes(path), str(path))

@@ -8,7 +8,7 @@ import numpy as np
 import pyopencl as cl
 
 from gi_core.arrays import Float32, Float64, UInt8, UInt16
-from gi_core.constants import VOLUME_SHAPE, VOXEL_NO_SECTOR
+from gi_core.constants import SECTOR_SIZE_M, VOLUME_SHAPE, VOXEL_NO_SECTOR
 from gi_core.dataset import Dataset
 from gi_core.device import shared_device
 from gi_core.errors import FormatError, OutsideWorldError
@@ -17,6 +17,7 @@ from gi_core.lighting import Lighting
 from gi_core.lighting_model import make_lighting
 from gi_core.relight import Relighter, ResidentSector
 from gi_core.relight_input import relight_input, sky_face_exitance
+from gi_core.sector import PROBE_IN_MARGIN
 from gi_core.volume import SectorBox, Volume, box_mask, box_record, fill_missing_columns, plan_boxes
 
 # Device memory that queries may keep sectors in.
@@ -86,6 +87,8 @@ class Engine:
                 return self._lit[key]
             resident = self._resident(index)
             cubes = self._relighter.converge(resident, relight_input(lighting, self.dataset.world.sun_table)).cubes
+            # Every later query gets this very array.
+            cubes.setflags(write=False)
             self._lit[key] = cubes
             while len(self._lit) > LIT_SECTORS:
                 self._lit.popitem(last=False)
@@ -117,24 +120,24 @@ class Engine:
         return Distant(values.astype(np.float32), texels.origin, texels.valid)
 
     def probes(self, position: Float64, radius: float, lighting: Lighting) -> LitProbes:
-        """Probes within ``radius`` [m] of a world position (3,) [m], from every sector that the circle touches.
+        """Probes within ``radius`` [m] of a world position (3,) [m], each from the sector that it lies in: row by row, as stored.
+
+        A sector's copies of its neighbours' probes, which it keeps so that no seam shows, are left out.
 
         Raises OutsideWorldError, CorruptFileError.
         """
         self._expect_inside(position)
-        low, high = (np.floor((np.asarray(position) + sign * radius) / 64.0).astype(int) for sign in (-1, 1))
+        low, high = (np.floor((np.asarray(position)[[0, 2]] + sign * radius) / SECTOR_SIZE_M) for sign in (-1, 1))
+        touched = [i for i in self.dataset.world.sectors if low[0] <= i.x <= high[0] and low[1] <= i.z <= high[1]]
         found = []
-        for z in range(low[2], high[2] + 1):
-            for x in range(low[0], high[0] + 1):
-                index = SectorIndex(x, z)
-                if index not in self.dataset.world.sectors:
-                    continue
-                with self._lock:
-                    cubes = self.lit_sector(index, lighting)
-                    sector = self._resident(index).sector
-                world = sector.probe_position + index.origin
-                near = np.flatnonzero(np.linalg.norm(world - position, axis=1) <= radius)
-                found.append((world[near], cubes[near], sector.probe_room[near], sector.probe_flags[near], [index] * len(near)))
+        for index in sorted(touched, key=lambda i: (i.z, i.x)):
+            with self._lock:
+                cubes = self.lit_sector(index, lighting)
+                sector = self._resident(index).sector
+            world = sector.probe_position + index.origin
+            own = sector.probe_flags & PROBE_IN_MARGIN == 0
+            near = np.flatnonzero(own & (np.linalg.norm(world - position, axis=1) <= radius))
+            found.append((world[near], cubes[near], sector.probe_room[near], sector.probe_flags[near], [index] * len(near)))
         if not found:
             raise OutsideWorldError(self._outside(position))
         position_, cubes_, room, flags = (np.concatenate([part[i] for part in found]) for i in range(4))

@@ -30,10 +30,10 @@ class Geometry:
     emission: Float32
 
 
-def encode(index: SectorIndex, geometry: Geometry) -> bytes:
+def encode(index: SectorIndex, geometry: Geometry, bake_id: str) -> bytes:
     """Bytes of a geometry file: unique vertices in steps of 1/512 m, triangles, and a table of distinct materials.
 
-    Triangles that the rounding makes degenerate are left out.
+    ``bake_id`` names the bake, as in the sector's other file. Triangles that the rounding makes degenerate are left out.
     """
     steps = quantise.encode_length(geometry.vertices - index.origin)
     vertices, inverse = np.unique(steps, axis=0, return_inverse=True)
@@ -49,14 +49,17 @@ def encode(index: SectorIndex, geometry: Geometry) -> bytes:
         "material_albedo": material[:, :3].astype(np.uint8),
         "material_emission": material[:, 3:].astype(np.float32),
     }
-    return container.encode(KIND, VERSION, {"sector": list(index)}, arrays, frozenset({"vertex", "triangle"}))
+    return container.encode(KIND, VERSION, {"sector": list(index), "bake_id": bake_id}, arrays, frozenset({"vertex", "triangle"}))
 
 
-def decode(data: bytes, where: str) -> Geometry:
-    """Triangles of a geometry file, every index checked. Raises CorruptFileError or FormatVersionError."""
+def decode(data: bytes, where: str) -> tuple[Geometry, SectorIndex, str]:
+    """Triangles of a geometry file, every index checked, the sector that they belong to, and their bake's id.
+
+    Raises CorruptFileError or FormatVersionError.
+    """
     found = container.decode(data, KIND, VERSION, where)
     try:
-        index = SectorIndex(*(int(v) for v in found.meta["sector"]))
+        index, bake_id = SectorIndex(*(int(v) for v in found.meta["sector"])), str(found.meta["bake_id"])
         vertex, triangle = found.take("vertex", "i4", 2), found.take("triangle", "i4", 2)
         material = found.take("material", "u4", 1)
         albedo, emission = found.take("material_albedo", "u1", 2), found.take("material_emission", "f4", 2)
@@ -68,18 +71,21 @@ def decode(data: bytes, where: str) -> Geometry:
             and (not material.size or material.max() < len(albedo))
             and bool(np.isfinite(emission).all())
         )
-    except (KeyError, TypeError, ValueError) as error:
+    except CorruptFileError as error:
+        raise CorruptFileError(f"{where}: {error}; bake it again") from error
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise CorruptFileError(f"{where}: inconsistent contents ({error}); bake it again") from error
     if not fits:
         raise CorruptFileError(f"{where}: a triangle or material index is out of range; bake it again")
-    return Geometry(
+    geometry = Geometry(
         vertices=quantise.decode_length(vertex.T) + index.origin,
         triangles=np.ascontiguousarray(triangle.T),
         albedo=quantise.decode_root(albedo)[material],
         emission=emission[material],
     )
+    return geometry, index, bake_id
 
 
-def read(path: Path) -> Geometry:
+def read(path: Path) -> tuple[Geometry, SectorIndex, str]:
     """A geometry file from disk, as ``decode``."""
-    return decode(path.read_bytes(), str(path))
+    return decode(container.read_bytes(path), str(path))

@@ -8,7 +8,7 @@ import numpy as np
 
 from gi_core import container, quantise
 from gi_core.arrays import AnyArray, Float32, UInt8
-from gi_core.constants import BRICK_CELL_M, MAX_BRICK_LEVEL
+from gi_core.constants import ALBEDO_MAX, BRICK_CELL_M, MAX_BRICK_LEVEL
 from gi_core.container import Container
 from gi_core.errors import CorruptFileError
 from gi_core.grid import SectorIndex
@@ -17,6 +17,8 @@ from gi_core.sector import Sector, check_sector, counts, starts
 KIND = "SECT"
 VERSION = 1
 NO_PROBE = 0xFFFF
+# Kernels are built for the number of probes that a surfel or voxel blends: a file must not choose how long a compiler runs.
+MAX_BLENDED_PROBES = 32
 # A brick's cell is divided into 256 steps: 1.6 cm of 4 m.
 _CELL_STEPS = 256
 
@@ -80,7 +82,7 @@ def decode(data: bytes, where: str) -> tuple[Sector, dict[str, Any]]:
 
 def read(path: Path) -> tuple[Sector, dict[str, Any]]:
     """A sector file from disk, as ``decode``."""
-    return decode(path.read_bytes(), str(path))
+    return decode(container.read_bytes(path), str(path))
 
 
 def quantised(sector: Sector, sky_patches: int) -> Sector:
@@ -156,13 +158,16 @@ def _sector(found: Container) -> Sector:
     cell, size = _surfel_cells(brick_cell, brick_level, brick_starts)
     position = (cell + (in_cell.astype(np.float64) + 0.5) / _CELL_STEPS) * size
     feedback = take("feedback_probe", "u2", 2).T
+    voxel_share = np.moveaxis(take("voxel_weight", "u1", 4), 0, 3)
+    if not 1 <= feedback.shape[1] <= MAX_BLENDED_PROBES or not 1 <= voxel_share.shape[3] <= MAX_BLENDED_PROBES:
+        raise CorruptFileError(f"expected 1 to {MAX_BLENDED_PROBES} probes for each surfel and voxel")
     lit = feedback != NO_PROBE
     if feedback.shape[1] > 1:
         share = take("feedback_weight", "u1", 2).T * lit
         feedback_weight = share / np.maximum(share.sum(axis=1, keepdims=True), 1)
     else:
         feedback_weight = lit
-    voxel_share = np.moveaxis(take("voxel_weight", "u1", 4), 0, 3).astype(np.float32)
+    voxel_share = voxel_share.astype(np.float32)
     voxel_weight = voxel_share / np.maximum(voxel_share.sum(axis=3, keepdims=True), 1)
     emission = take("surfel_emission", "f4", 2).T if "surfel_emission" in found.arrays else None
     index = found.meta["sector"]
@@ -182,7 +187,8 @@ def _sector(found: Container) -> Sector:
         brick_direction=take("brick_direction", "u1", 1),
         surfel_position=np.ascontiguousarray(position, np.float32),
         surfel_normal=quantise.decode_unit(take("surfel_normal", "u1", 2)),
-        surfel_albedo=np.ascontiguousarray(quantise.decode_root(take("surfel_albedo", "u1", 2)).T),
+        # The code next to 0.95 stands for 0.9535, and the bounces' convergence rests on the bound.
+        surfel_albedo=np.minimum(quantise.decode_root(take("surfel_albedo", "u1", 2)).T, np.float32(ALBEDO_MAX)),
         surfel_snow=take("surfel_snow", "u1", 1).astype(np.float32) / np.float32(255),
         surfel_emission=None if emission is None else np.ascontiguousarray(emission),
         feedback_probe=np.ascontiguousarray(np.where(lit, feedback, 0), np.uint16),
