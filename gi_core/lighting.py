@@ -2,6 +2,7 @@
 
 import hashlib
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -43,7 +44,7 @@ class Lighting:
     fog_density: float
     exposure: float
 
-    @property
+    @cached_property
     def digest(self) -> str:
         """32 hexadecimal digits that identify everything in the snapshot which changes light; half of an ETag."""
         h = hashlib.blake2b(digest_size=16)

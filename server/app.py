@@ -9,6 +9,7 @@ from fastapi.staticfiles import StaticFiles
 
 from server import problems
 from server.dependencies import refuse_repeated_parameters
+from server.finished_replies import AnswerFromFinished
 from server.head_requests import HeadRequests
 from server.routes import distant, health, lighting, preview, probes, sectors, volume, world
 from server.service import Service
@@ -33,6 +34,7 @@ def app_of(service: Service) -> FastAPI:
         redirect_slashes=False,
     )
     app.state.service = service
+    app.add_middleware(AnswerFromFinished, replies=service.replies)
     app.add_middleware(HeadRequests)
     problems.install(app)
     for resource in (health, world, lighting, volume, distant, sectors, probes, preview):

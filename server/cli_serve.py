@@ -5,6 +5,7 @@ import socket
 from pathlib import Path
 
 import uvicorn
+from starlette.types import ASGIApp
 
 from gi_core.errors import InputError
 from server.app import create_app
@@ -23,11 +24,16 @@ def run(dataset_path: Path, settings: Settings) -> None:
         app = create_app(dataset_path, settings)
         host = f"[{settings.host}]" if ":" in settings.host else settings.host
         print(f"Serving {dataset_path} at http://{host}:{listener.getsockname()[1]}/", flush=True)
-        config = uvicorn.Config(app, log_level="warning", timeout_graceful_shutdown=SHUTDOWN_GRACE_S, server_header=False)
         try:
-            uvicorn.Server(config).run(sockets=[listener])
+            listen(app, listener)
         except KeyboardInterrupt:  # how uvicorn ends after its own clean shutdown
             print("Stopped.", flush=True)
+
+
+def listen(app: ASGIApp, listener: socket.socket) -> None:
+    """Answer at a bound socket until interrupted, which raises KeyboardInterrupt."""
+    config = uvicorn.Config(app, log_level="warning", timeout_graceful_shutdown=SHUTDOWN_GRACE_S, server_header=False)
+    uvicorn.Server(config).run(sockets=[listener])
 
 
 def bind(host: str, port: int) -> socket.socket:

@@ -10,6 +10,7 @@ from gi_core.dataset import Dataset
 from gi_core.engine import Engine
 from gi_core.grid import SectorIndex
 from gi_core.lighting import Lighting
+from server.finished_replies import FinishedReplies
 from server.preview_scene import PreviewScenes
 from server.settings import Settings
 
@@ -27,6 +28,7 @@ class Service:
         self.dataset = dataset
         self.engine = engine
         self.settings = settings
+        self.replies = FinishedReplies()
         self.preview_scenes = PreviewScenes(dataset)
         self._preview_lock = threading.Lock()
         self._misfits = misfits(dataset, dataset.world.sectors)
@@ -48,6 +50,11 @@ class Service:
     def lighting(self, time: str, weather: str) -> Lighting:
         """The light of a moment; UnknownTimeError or UnknownWeatherError when there is no such moment."""
         return self.engine.lighting(time, weather)
+
+    @property
+    def light_identity(self) -> str:
+        """What decides the bits of served light beside the query: the dataset, and the device, whose sums may round differently."""
+        return f"{self.dataset.digest} {self.engine.device_name}"
 
     @property
     def failed_sectors(self) -> dict[SectorIndex, str]:

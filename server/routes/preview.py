@@ -22,7 +22,7 @@ router = APIRouter(prefix="/v1", tags=["pictures"])
 def preview(request: Request, service: ServiceDep, query: Annotated[PreviewQuery, Query()]) -> Response:
     """The city at a time and in a weather, lit directly by sun and moon and indirectly by the volumes that /v1/volume serves."""
     light = service.lighting(query.time, query.weather)
-    etag = strong_etag("preview", REPLY_VERSION, service.dataset.digest, light.digest, query.model_dump(exclude={"time", "weather"}))
+    etag = strong_etag("preview", REPLY_VERSION, service.light_identity, light.digest, query.model_dump(exclude={"time", "weather"}))
     return conditional(request, etag, lambda: Body(picture(service, query, light), "image/png"))
 
 

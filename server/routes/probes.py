@@ -16,7 +16,7 @@ router = APIRouter(prefix="/v1", tags=["light"])
 def probes(request: Request, service: ServiceDep, query: Annotated[ProbesQuery, Query()]) -> Response:
     """Positions, cubes, rooms and flags of the probes within `radius` of a point."""
     light = service.lighting(query.time, query.weather)
-    etag = strong_etag("probes", REPLY_VERSION, service.dataset.digest, light.digest, query.model_dump())
+    etag = strong_etag("probes", REPLY_VERSION, service.light_identity, light.digest, query.model_dump())
 
     def compute() -> Body:
         found = service.engine.probes(query.position, query.radius, light)

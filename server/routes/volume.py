@@ -23,7 +23,7 @@ def volume(request: Request, service: ServiceDep, query: Annotated[VolumeQuery, 
     `mask=1`: uint8 (16, 32, 32), 0 solid, 1 outdoors, 2 indoors, 3 no sector there. The header `Gi-Volume` places it in the world.
     """
     light = service.lighting(query.time, query.weather)
-    etag = strong_etag("volume", REPLY_VERSION, service.dataset.digest, light.digest, query.model_dump(exclude={"time", "weather"}))
+    etag = strong_etag("volume", REPLY_VERSION, service.light_identity, light.digest, query.model_dump(exclude={"time", "weather"}))
 
     def compute() -> Body:
         found = service.engine.volume(query.position, light)

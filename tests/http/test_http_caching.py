@@ -67,7 +67,40 @@ def test_a_client_that_has_the_volume_costs_no_relighting(
 
     monkeypatch.setattr(app.state.service.engine, "volume", refuse)
     assert http.get("/v1/volume", params={**moment, **place}, headers={"If-None-Match": etag}).status_code == 304
+    app.state.service.replies.clear()
+    assert http.get("/v1/volume", params={**moment, **place}, headers={"If-None-Match": etag}).status_code == 304
     assert http.get("/v1/volume", params={**moment, **place}).status_code == 500  # so the refusal above does work
+
+
+def test_a_volume_that_was_served_is_not_lit_again(
+    http: httpx.Client, app: FastAPI, moment: dict[str, Any], place: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = http.get("/v1/volume", params={**moment, **place})
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("the engine was asked")
+
+    monkeypatch.setattr(app.state.service.engine, "volume", refuse)
+    date = http.get("/v1/world").json()["location"]["date"]
+    # Letter by letter, in another order, and as another spelling of the same moment.
+    for query in ({**moment, **place}, {**place, **moment}, {**place, **moment, "time": f"{date}T{moment['time']}"}):
+        again = http.get("/v1/volume", params=query)
+        assert (again.status_code, again.content) == (200, first.content)
+        assert {k: v for k, v in again.headers.items() if k != "date"} == {k: v for k, v in first.headers.items() if k != "date"}
+    head = http.head("/v1/volume", params={**moment, **place})
+    assert (head.content, head.headers["content-length"]) == (b"", str(len(first.content)))
+
+
+def test_a_device_s_light_has_its_own_etag(
+    http: httpx.Client, app: FastAPI, moment: dict[str, Any], place: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    paths = {"/v1/volume": place, "/v1/probes": place, "/v1/preview.png": {"eye": "-10,20,-10", "look": "30,0,30", "width": 16}}
+    before = {path: http.get(path, params={**moment, **query}).headers["etag"] for path, query in paths.items()}
+    app.state.service.replies.clear()
+    monkeypatch.setattr(type(app.state.service.engine), "device_name", "another device")
+    for path, query in paths.items():
+        assert http.get(path, params={**moment, **query}).headers["etag"] != before[path], path
+    app.state.service.replies.clear()  # what was made under the other name must not be answered to later tests
 
 
 def first_sector(http: httpx.Client) -> tuple[str, bytes, str]:
