@@ -50,6 +50,12 @@ class Container:
             raise CorruptFileError(f"array {name!r}: expected {dtype} with {ndim} axes, found {found.dtype.str} {found.shape}")
         return found
 
+    def refuse_unknown(self, meta: frozenset[str], arrays: frozenset[str]) -> None:
+        """Raise CorruptFileError when the file has members of meta or arrays besides these: they would change what it means."""
+        unknown = sorted((set(self.meta) - meta) | (set(self.arrays) - arrays))
+        if unknown:
+            raise CorruptFileError(f"expected no such member or array as {', '.join(map(ascii, unknown))[:60]}")
+
 
 def encode(kind: str, version: int, meta: dict[str, Any], arrays: dict[str, AnyArray], delta: frozenset[str] = frozenset()) -> bytes:
     """Bytes of a container.
@@ -99,6 +105,8 @@ def decode(data: bytes, kind: str, version: int, where: str) -> Container:
         if zstandard.frame_content_size(payload) != raw_bytes:
             raise CorruptFileError(f"{where}: expected one zstd frame of {raw_bytes} bytes; bake it again")
         raw = zstandard.ZstdDecompressor().decompress(payload, allow_extra_data=False) if raw_bytes else b""
+        if not isinstance(parsed["meta"], dict):
+            raise CorruptFileError(f"{where}: expected meta to be an object; bake it again")
         return Container(parsed["meta"], _read_arrays(parsed["arrays"], raw, raw_bytes, where))
     except (zstandard.ZstdError, ValueError, KeyError, TypeError, RecursionError) as error:
         if isinstance(error, CorruptFileError):

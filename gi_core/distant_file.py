@@ -52,6 +52,7 @@ def decode(data: bytes, where: str) -> tuple[DistantTexels, str]:
     """Texels of a distant file, and their bake's id. Raises CorruptFileError or FormatVersionError."""
     found = container.decode(data, KIND, VERSION, where)
     try:
+        found.refuse_unknown(frozenset({"origin", "bake_id"}), frozenset({"sky", "valid"}))
         sky, valid = found.take("sky", "f4", 3), found.take("valid", "u1", 2)
         origin, bake_id = SectorIndex(*(int(v) for v in found.meta["origin"])), str(found.meta["bake_id"])
     except CorruptFileError as error:

@@ -12,6 +12,7 @@ from gi_core.grid import SectorIndex
 
 KIND = "GEOM"
 VERSION = 1
+_ARRAYS = frozenset({"vertex", "triangle", "material", "material_albedo", "material_emission"})
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +60,7 @@ def decode(data: bytes, where: str) -> tuple[Geometry, SectorIndex, str]:
     """
     found = container.decode(data, KIND, VERSION, where)
     try:
+        found.refuse_unknown(frozenset({"sector", "bake_id"}), _ARRAYS)
         index, bake_id = SectorIndex(*(int(v) for v in found.meta["sector"])), str(found.meta["bake_id"])
         vertex, triangle = found.take("vertex", "i4", 2), found.take("triangle", "i4", 2)
         material = found.take("material", "u4", 1)

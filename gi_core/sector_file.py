@@ -21,6 +21,10 @@ NO_PROBE = 0xFFFF
 MAX_BLENDED_PROBES = 32
 # A brick's cell is divided into 256 steps: 1.6 cm of 4 m.
 _CELL_STEPS = 256
+_META = frozenset({"sector", "sky_patches", "voxel_first", "bake"})
+# Fields that are stored under another name: starts as counts, positions within their brick's cell.
+_RENAMED = {"factor_starts": "factor_count", "brick_starts": "brick_count", "surfel_position": "surfel_in_cell"}
+_ARRAYS = frozenset(_RENAMED.get(f.name, f.name) for f in fields(Sector)) - {"index", "voxel_first"} | {"factor_scale"}
 
 
 def encode(sector: Sector, meta: dict[str, Any], sky_patches: int) -> bytes:
@@ -145,6 +149,7 @@ def _decode_weights(codes: AnyArray, scales: AnyArray, factor_starts: AnyArray, 
 
 def _sector(found: Container) -> Sector:
     take = found.take
+    found.refuse_unknown(_META, _ARRAYS)
     factor_starts, brick_starts = starts(take("factor_count", "u2", 1)), starts(take("brick_count", "u2", 1))
     brick_cell = np.ascontiguousarray(take("brick_cell", "i4", 2).T)
     brick_level = take("brick_level", "u1", 1)

@@ -1,0 +1,100 @@
+"""Writes tests/golden/v<version>: a dataset of two sectors, small enough to keep, that has every array of the format.
+
+    python tests/golden/make_golden.py
+
+Run it only for a new format version. Files of a version that was released are never written again: they stand for what users have.
+"""
+
+import hashlib
+from dataclasses import asdict, replace
+from datetime import date
+from pathlib import Path
+
+import numpy as np
+
+from bake_jobs.config import BakeSettings, settings_for
+from bake_jobs.geometry_clip import SectorCutter
+from bake_jobs.scene import Mesh, Scene, join_meshes
+from bake_jobs.sector_job import SKY_FACES, SectorBaker
+from bake_jobs.solids import boxes
+from gi_core import distant_file
+from gi_core.container import write_atomic
+from gi_core.dataset import DISTANT_FILE, VERSION, SectorFacts, WorldInfo, geometry_path, sector_path, write_world
+from gi_core.grid import SectorIndex
+from gi_core.sun_table import SunTable
+from gi_core.world import Lamp, Location, Room
+
+BAKE_ID = "0123456789abcdef0123456789abcdef"
+# Coarse enough for a few probes, and more than one feedback probe, so that their weights are stored.
+SETTINGS = replace(
+    settings_for("draft"),
+    grid_spacing_m=16.0,
+    wall_spacing_m=32.0,
+    rays_per_face_edge=4,
+    sun_declination_step_degrees=40.0,
+    sun_hour_step_degrees=45.0,
+    feedback_probes=2,
+)
+
+
+def tiny_scene() -> Scene:
+    """Ground under two sectors, one of them with a negative index; a box; and another that shines."""
+    ground = Mesh.of_colour(
+        np.array([[-64.0, 0, 0], [-64, 0, 64], [64, 0, 64], [64, 0, 0]]), np.array([[0, 1, 2], [0, 2, 3]]), (0.3, 0.3, 0.3)
+    )
+    box = Mesh.of_colour(*boxes(np.array([20.0, 0, 22]), np.array([30.0, 9, 35])), (0.6, 0.5, 0.4))
+    sign = Mesh.of_colour(*boxes(np.array([-30.0, 0, 25]), np.array([-24.0, 6, 40])), (0.5, 0.5, 0.5))
+    sign = replace(sign, emission=np.full_like(sign.emission, 250.0))
+    mesh = join_meshes([ground, box, sign])
+    return Scene(
+        mesh.vertices,
+        mesh.triangles.astype(np.int32),
+        mesh.albedo,
+        mesh.emission,
+        name="golden",
+        location=Location(52.52, 13.405, 34.0, "Europe/Berlin", 10.0, date(2024, 3, 20), "given"),
+        rooms=(Room("hall", (40.0, 0.0, 40.0), (50.0, 4.0, 50.0)),),
+        lamps=(Lamp("lamp", "point", (10.0, 5.0, 10.0), 8000.0, (1.0, 0.8, 0.6), 25.0),),
+    )
+
+
+def write_golden(folder: Path, settings: BakeSettings = SETTINGS) -> WorldInfo:
+    """The whole dataset into a folder."""
+    scene = tiny_scene()
+    table = SunTable.build(scene.location, settings.sun_declination_step_degrees, settings.sun_hour_step_degrees)
+    baker = SectorBaker(scene, settings, table.directions, BAKE_ID)
+    sectors: dict[SectorIndex, SectorFacts] = {}
+    sky: dict[SectorIndex, list[float]] = {}
+    for index in SectorCutter(scene).sectors():
+        baked = baker.bake(index)
+        write_atomic(geometry_path(folder, index), baked.geometry_bytes)
+        write_atomic(sector_path(folder, index), baked.sector_bytes)
+        digest = hashlib.blake2b(baked.sector_bytes, digest_size=16).hexdigest()
+        counted = {name: baked.meta[name] for name in SectorFacts.__dataclass_fields__ if name in baked.meta}
+        sectors[index] = SectorFacts(bytes=len(baked.sector_bytes), digest=digest, geometry_bytes=len(baked.geometry_bytes), **counted)
+        sky[index] = baked.meta["distant_sky"]
+    write_atomic(folder / DISTANT_FILE, distant_file.encode(distant_file.assemble(sky), BAKE_ID))
+    world = WorldInfo(
+        name=scene.name,
+        source="tests/golden/make_golden.py",
+        bake_id=BAKE_ID,
+        location=scene.location,
+        bounds=scene.bounds,
+        preset=settings.preset,
+        basis=settings.basis,
+        sky_patches=SKY_FACES,
+        settings=settings.to_json(),
+        seed=0,
+        sun_table=table,
+        sectors=sectors,
+        rooms=scene.rooms,
+        lamps=scene.lamps,
+        dropped_triangles=asdict(scene.dropped),
+    )
+    write_world(folder, world)
+    return world
+
+
+if __name__ == "__main__":
+    target = Path(__file__).parent / f"v{VERSION}"
+    print(target, write_golden(target).counts)

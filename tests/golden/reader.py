@@ -1,0 +1,148 @@
+"""Reads dataset files from what gi_core/FORMAT.md says, and from nothing else: a second opinion on the format, and an example."""
+
+import hashlib
+import json
+import math
+import struct
+from typing import Any
+
+import numpy as np
+import zstandard
+
+Arrays = dict[str, np.ndarray]
+
+
+def read_container(data: bytes, kind: str, version: int = 1) -> tuple[dict[str, Any], Arrays]:
+    """meta and arrays of a container (section 1)."""
+    assert 64 <= len(data) <= 64 + 2**20 + 2**28
+    magic, found_kind, found_version = struct.unpack_from("<8s4sI", data, 0)
+    assert (magic, found_kind, found_version) == (b"SECTORLT", kind.encode(), version)
+    header_bytes, _, payload_bytes, raw_bytes = struct.unpack_from("<IIQQ", data, 16)
+    assert header_bytes <= 2**20
+    assert raw_bytes <= 2**28
+    assert len(data) == 64 + header_bytes + payload_bytes
+    assert hashlib.blake2b(data[:40] + data[64:], digest_size=16).digest() == data[40:56]
+    header = json.loads(data[64 : 64 + header_bytes])
+    payload = data[64 + header_bytes :]
+    assert zstandard.frame_content_size(payload) == raw_bytes
+    raw = zstandard.ZstdDecompressor().decompress(payload)
+    arrays: Arrays = {}
+    offset = 0
+    for entry in header["arrays"]:
+        dtype = np.dtype("<" + entry["dtype"])
+        items = math.prod(entry["shape"])
+        planes = np.frombuffer(raw, np.uint8, items * dtype.itemsize, offset).reshape(dtype.itemsize, items)
+        values = np.frombuffer(planes.T.tobytes(), dtype).reshape(entry["shape"])
+        if entry["delta"]:
+            values = np.cumsum(values, axis=-1, dtype=dtype)
+        arrays[entry["name"]] = values
+        offset += items * dtype.itemsize
+    assert offset == raw_bytes
+    return header["meta"], arrays
+
+
+def length(codes: np.ndarray) -> np.ndarray:
+    return codes / 512.0
+
+
+def root(codes: np.ndarray) -> np.ndarray:
+    return (codes / 255.0) ** 2
+
+
+def unit(codes: np.ndarray) -> np.ndarray:
+    """(2, n) -> (n, 3), one vector at a time, as section 2 says it."""
+    vectors = []
+    for a, b in codes.T.tolist():
+        u, v = min((a - 127) / 127, 1.0), min((b - 127) / 127, 1.0)
+        y = 1 - abs(u) - abs(v)
+        if y < 0:
+            u, v = (1 - abs(v)) * (1 if u >= 0 else -1), (1 - abs(u)) * (1 if v >= 0 else -1)
+        vectors.append(np.array([u, y, v]) / math.sqrt(u * u + y * y + v * v))
+    return np.array(vectors).reshape(-1, 3)
+
+
+def starts(lengths: np.ndarray) -> np.ndarray:
+    return np.concatenate([[0], np.cumsum(lengths.astype(np.int64))])
+
+
+def shares(codes: np.ndarray) -> np.ndarray:
+    """Shares along the first axis."""
+    total = codes.sum(axis=0, dtype=np.int64)
+    return np.where(total > 0, codes / np.maximum(total, 1), 0.0)
+
+
+def read_sector(data: bytes) -> tuple[dict[str, Any], Arrays]:
+    """meta, and the arrays under the names and shapes of gi_core.sector.Sector (section 3)."""
+    meta, a = read_container(data, "SECT")
+    factor_starts, brick_starts = starts(a["factor_count"]), starts(a["brick_count"])
+    bricks = len(a["brick_count"])
+    weight = np.zeros((len(a["factor_source"]), 6))
+    for probe in range(len(a["factor_count"])):
+        for f in range(factor_starts[probe], factor_starts[probe + 1]):
+            kind = 0 if a["factor_source"][f] < bricks else 1
+            weight[f] = root(a["factor_weight"][:, f]) * a["factor_scale"][kind, :, probe].astype(np.float64)
+    position = np.zeros((brick_starts[-1], 3))
+    for brick in range(bricks):
+        for s in range(brick_starts[brick], brick_starts[brick + 1]):
+            in_cell = (a["surfel_in_cell"][:, s] + 0.5) / 256
+            position[s] = (a["brick_cell"][:, brick] + in_cell) * 4 * 2 ** int(a["brick_level"][brick])
+    lit = a["feedback_probe"] != 65535
+    feedback_codes = a["feedback_weight"] if len(lit) > 1 else np.ones(lit.shape, np.uint8)
+    decoded = {
+        "probe_position": length(a["probe_position"]).T,
+        "probe_flags": a["probe_flags"],
+        "probe_room": a["probe_room"],
+        "factor_starts": factor_starts,
+        "factor_source": a["factor_source"],
+        "factor_weight": weight,
+        "brick_starts": brick_starts,
+        "brick_level": a["brick_level"],
+        "brick_cell": a["brick_cell"].T,
+        "brick_direction": a["brick_direction"],
+        "surfel_position": position,
+        "surfel_normal": unit(a["surfel_normal"]),
+        "surfel_albedo": np.minimum(root(a["surfel_albedo"]), 0.95).T,
+        "surfel_snow": a["surfel_snow"] / 255.0,
+        "feedback_probe": np.where(lit, a["feedback_probe"], 0).T,
+        "feedback_weight": shares(np.where(lit, feedback_codes, 0)).T,
+        "sun_visibility": a["sun_visibility"],
+        "voxel_first": np.array(meta["voxel_first"]),
+        "voxel_class": a["voxel_class"],
+        "voxel_room": a["voxel_room"],
+        "voxel_probe": np.moveaxis(a["voxel_probe"], 0, 3),
+        "voxel_weight": np.moveaxis(shares(a["voxel_weight"]), 0, 3),
+    }
+    if "surfel_emission" in a:
+        decoded["surfel_emission"] = a["surfel_emission"].T
+    return meta, decoded
+
+
+def read_geometry(data: bytes) -> tuple[dict[str, Any], Arrays]:
+    """meta, and world-frame vertices, triangles, albedo and emission of each triangle (section 4)."""
+    meta, a = read_container(data, "GEOM")
+    x, z = meta["sector"]
+    return meta, {
+        "vertices": length(a["vertex"]).T + np.array([64.0 * x, 0.0, 64.0 * z]),
+        "triangles": a["triangle"].T,
+        "albedo": root(a["material_albedo"])[a["material"]],
+        "emission": a["material_emission"][a["material"]],
+    }
+
+
+def read_distant(data: bytes) -> tuple[dict[str, Any], Arrays]:
+    """meta, sky and valid (section 5)."""
+    return read_container(data, "DIST")
+
+
+def sun_plane_count(latitude: float, north: float, declination_step: float, hour_angle_step: float) -> int:
+    """D, by walking over the nodes (section 6)."""
+    rows, columns = math.ceil(46.88 / declination_step) + 1, math.ceil(360 / hour_angle_step)
+    kept = 0
+    for row in range(rows):
+        declination = math.radians(-23.44 + 46.88 * row / (rows - 1))
+        for column in range(columns):
+            hour_angle = 2 * math.pi * column / columns
+            at = math.radians(latitude)
+            y = math.sin(at) * math.sin(declination) + math.cos(at) * math.cos(declination) * math.cos(hour_angle)
+            kept += y > -math.sin(math.radians(max(declination_step, hour_angle_step)))
+    return kept

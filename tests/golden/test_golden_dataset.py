@@ -1,0 +1,162 @@
+"""Datasets that users have stay readable, as FORMAT.md describes them: files of every format version, kept for good.
+
+When one of these tests fails, the format has changed: raise the version (FORMAT.md, section 7) and add tests/golden/v<version> with
+make_golden.py; do not write a released version's files again.
+"""
+
+import hashlib
+import importlib.util
+import json
+import sys
+from dataclasses import fields
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from gi_core import dataset, distant_file, geometry_file, sector_file
+from gi_core.dataset import Dataset
+from gi_core.engine import Engine
+from gi_core.sector import Sector
+
+GOLDEN = Path(__file__).parent / "v1"
+SECTORS = sorted((GOLDEN / "sectors").iterdir())
+GEOMETRIES = sorted((GOLDEN / "geometry").iterdir())
+DIGEST_OF_WHAT_V1_HOLDS = "be106385c9073a1fafb6b39d699ddb88"
+
+
+def neighbour(name: str) -> ModuleType:
+    """A module beside this file: test folders are no packages."""
+    spec = importlib.util.spec_from_file_location(f"golden_{name}", Path(__file__).parent / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    return module
+
+
+reader = neighbour("reader")
+
+
+def stored_arrays(path: Path) -> set[tuple[str, str, bool, int]]:
+    """Name, dtype, delta and rank of each array of a file."""
+    data = path.read_bytes()
+    header = json.loads(data[64 : 64 + int.from_bytes(data[16:20], "little")])
+    return {(a["name"], a["dtype"], a["delta"], len(a["shape"])) for a in header["arrays"]}
+
+
+def test_the_golden_dataset_is_small_and_whole():
+    assert sum(path.stat().st_size for path in GOLDEN.rglob("*") if path.is_file()) < 60_000
+    assert [path.stem for path in SECTORS] == [path.stem for path in GEOMETRIES] == ["-1_0", "0_0"]
+
+
+def test_every_golden_version_is_read_or_refused_by_name():
+    versions = sorted(int(path.name[1:]) for path in Path(__file__).parent.glob("v*") if path.is_dir())
+    assert versions[-1] == dataset.VERSION, "a new format version needs its golden dataset: run make_golden.py"
+    assert {sector_file.VERSION, geometry_file.VERSION, distant_file.VERSION, dataset.VERSION} == {1}, "give tests of v2 what these have"
+
+
+@pytest.mark.parametrize("path", SECTORS, ids=lambda p: p.stem)
+def test_a_sector_read_from_format_md_alone_is_the_sector(path):
+    meta, expected = reader.read_sector(path.read_bytes())
+    sector, bake = sector_file.read(path)
+    assert list(sector.index) == meta["sector"]
+    assert meta["bake"] == bake
+    # The golden scene was made to have every array that a sector can have.
+    assert set(expected) == {field.name for field in fields(Sector)} - {"index"}
+    for name, values in expected.items():
+        found = getattr(sector, name)
+        assert found.shape == values.shape, name
+        if found.dtype.kind == "f":
+            # One rounding to float32 of a float64 calculation, or two of float32's own.
+            np.testing.assert_allclose(found, values, rtol=2.5e-7, atol=1e-7, err_msg=name)
+        else:
+            np.testing.assert_array_equal(found, values, err_msg=name)
+
+
+@pytest.mark.parametrize("path", GEOMETRIES, ids=lambda p: p.stem)
+def test_geometry_read_from_format_md_alone_is_the_geometry(path):
+    meta, expected = reader.read_geometry(path.read_bytes())
+    geometry, index, bake_id = geometry_file.read(path)
+    assert (list(index), bake_id) == (meta["sector"], meta["bake_id"])
+    np.testing.assert_array_equal(geometry.vertices, expected["vertices"])
+    np.testing.assert_array_equal(geometry.triangles, expected["triangles"])
+    np.testing.assert_allclose(geometry.albedo, expected["albedo"], rtol=2.5e-7)  # float32 against float64
+    np.testing.assert_array_equal(geometry.emission, expected["emission"])
+
+
+def test_distant_texels_read_from_format_md_alone_are_the_texels():
+    meta, expected = reader.read_distant((GOLDEN / "distant.gidist").read_bytes())
+    texels, bake_id = distant_file.read(GOLDEN / "distant.gidist")
+    assert (list(texels.origin), bake_id) == (meta["origin"], meta["bake_id"])
+    np.testing.assert_array_equal(texels.sky, expected["sky"])
+    np.testing.assert_array_equal(texels.valid, expected["valid"])
+
+
+def test_world_json_agrees_with_the_files_it_names():
+    world = json.loads((GOLDEN / "world.json").read_bytes())
+    assert {f"{x},{z}" for x, z in ((-1, 0), (0, 0))} == set(world["sectors"])
+    for key, facts in world["sectors"].items():
+        name = key.replace(",", "_")
+        data = (GOLDEN / "sectors" / f"{name}.gisec").read_bytes()
+        meta, arrays = reader.read_sector(data)
+        assert facts["bytes"] == len(data)
+        assert facts["digest"] == hashlib.blake2b(data, digest_size=16).hexdigest()
+        assert facts["geometry_bytes"] == (GOLDEN / "geometry" / f"{name}.gigeo").stat().st_size
+        assert meta["bake"]["bake_id"] == world["bake_id"]
+        assert len(arrays["probe_position"]) == facts["probes"]
+        assert len(arrays["surfel_position"]) == facts["surfels"]
+        assert arrays["voxel_class"].size == facts["voxels"]
+        assert len(arrays["sun_visibility"]) == world["sun_table"]["planes"]
+    table = world["sun_table"]
+    planes = reader.sun_plane_count(
+        table["latitude_degrees"], table["north_degrees"], table["declination_step_degrees"], table["hour_angle_step_degrees"]
+    )
+    assert planes == table["planes"]
+
+
+def test_what_version_1_holds_has_not_changed():
+    """The digest is over decoded integers and bit patterns of floats: decoding uses only IEEE operations that round one way."""
+    opened = Dataset.open(GOLDEN)
+    h = hashlib.blake2b(digest_size=16)
+    for index in sorted(opened.world.sectors):
+        sector, geometry = opened.sector(index), opened.geometry(index)
+        arrays = [getattr(sector, field.name) for field in fields(Sector) if field.name != "index"]
+        for values in (*arrays, *vars(geometry).values()):
+            h.update(f"{values.dtype.str}{values.shape}".encode())
+            h.update(np.ascontiguousarray(values).tobytes())
+    texels = opened.distant()
+    h.update(texels.sky.tobytes() + texels.valid.tobytes())
+    h.update(json.dumps(opened.world.to_json(), sort_keys=True).encode())
+    assert h.hexdigest() == DIGEST_OF_WHAT_V1_HOLDS
+
+
+def test_the_golden_dataset_still_lights_a_street():
+    engine = Engine(Dataset.open(GOLDEN))
+    volume = engine.volume(np.array([5.0, 2.0, 30.0]), engine.lighting("12:00", "clear"))
+    assert volume.sectors == ((-1, 0), (0, 0))
+    # A street in a spring noon: tens of thousands of lux from the sky and the ground, none of them negative.
+    assert volume.values.min() >= 0
+    assert 5e3 < float(np.median(volume.values[2, ..., 1])) < 5e4
+
+
+def test_a_dataset_made_today_is_described_by_format_md(tmp_path):
+    world = neighbour("make_golden").write_golden(tmp_path)
+    opened = Dataset.open(tmp_path)
+    for index in world.sectors:
+        path = opened.sector_path(index)
+        _, arrays = reader.read_sector(path.read_bytes())
+        assert stored_arrays(path) == stored_arrays(GOLDEN / "sectors" / path.name), "another array, dtype or encoding is another version"
+        sector = opened.sector(index)
+        np.testing.assert_array_equal(arrays["voxel_probe"], sector.voxel_probe)
+        np.testing.assert_array_equal(arrays["factor_source"], sector.factor_source)
+        reader.read_geometry(dataset.geometry_path(tmp_path, index).read_bytes())
+
+
+def test_the_hexdump_in_format_md_is_the_golden_sector():
+    text = (Path(dataset.__file__).parent / "FORMAT.md").read_text(encoding="utf-8")
+    prefix = (GOLDEN / "sectors" / "0_0.gisec").read_bytes()[:64]
+    for offset in range(0, 64, 16):
+        assert f"    {offset:04x}  {prefix[offset : offset + 16].hex(' ')}  " in text
