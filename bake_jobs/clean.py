@@ -109,7 +109,7 @@ def _inside_out(vertices: Float64, triangles: Int64, rooms: tuple[Room, ...]) ->
     Negative on purpose, and left alone: a cavity (it lies inside another closed surface) and an enclosure such as a room seen from
     within (other geometry or an authored room lies inside it, or nothing lies outside it).
     """
-    component, closed = _closed_components(triangles)
+    component, closed = closed_components(triangles)
     count = len(closed)
     middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2  # far from the origin, volumes of absolute positions would cancel
     a, b, c = (vertices[triangles[:, i]] - middle for i in range(3))
@@ -150,7 +150,7 @@ def _component_bounds(vertices: Float64, triangles: Int64, component: Int64, cou
     return low, high
 
 
-def _closed_components(triangles: Int64) -> tuple[Int64, Bool]:
+def closed_components(triangles: Int64) -> tuple[Int64, Bool]:
     """(m,) component of each triangle and (n,) whether it is closed.
 
     Triangles connect where exactly two share an edge, in opposite senses; so solids that only touch stay apart. A component is

@@ -41,8 +41,8 @@ class BakeSettings:
     wall_offset_m: float = 1.0
     margin_m: float = 4.0
     cells_double_beyond_m: float = 8.0
-    sun_declination_step_degrees: float = 12.0
-    sun_hour_step_degrees: float = 12.0
+    sun_declination_step_degrees: float = 15.0
+    sun_hour_step_degrees: float = 15.0
     voxel_probes: int = 4
     voxel_candidates: int = 8
     feedback_probes: int = 1
