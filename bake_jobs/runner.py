@@ -15,6 +15,7 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -199,6 +200,19 @@ def _start_worker(arrays_path: Path, scene: Scene, settings: BakeSettings, table
     _output = output
 
 
+@contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Workers that start in this block never see Ctrl-C, not even before they can ignore it; the parent sees it when the block ends."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _bake_one(index: SectorIndex) -> _Finished:
     assert _baker is not None
     started = time.process_time()
@@ -231,7 +245,8 @@ def _run(
         try:
             # A few tasks ahead of the workers, so that an interrupt has little to wait for.
             for index in queue:
-                pending.add(pool.submit(_bake_one, index))
+                with _interrupts_held():
+                    pending.add(pool.submit(_bake_one, index))
                 if len(pending) < 2 * workers:
                     continue
                 finished, pending = wait(pending, return_when=FIRST_COMPLETED)

@@ -30,7 +30,10 @@ ROTATION = 8
 
 @dataclass(frozen=True)
 class Measurement:
-    """One row of ``bench --json``. ``median`` and ``baseline`` are in ``unit``; ``ratio`` says how many times better the median is."""
+    """One row of ``bench --json``. ``median`` and ``baseline`` are in ``unit``; ``ratio`` is how many times as good the median is:
+
+    baseline / median where they are times, median / baseline where they are rates. Above 1, the median is the better of the two.
+    """
 
     name: str
     median: float
@@ -46,15 +49,21 @@ class Measurement:
         return asdict(self)
 
 
-def seconds(run: Callable[[], object], repeats: int) -> float:
-    """Median wall time [s] of ``run``, after one call that is not counted."""
-    run()
-    taken = []
-    for _ in range(repeats):
-        started = time.perf_counter()
-        run()
-        taken.append(time.perf_counter() - started)
-    return float(np.median(taken))
+def side_by_side(measured: Callable[[], object], baseline: Callable[[], object], rounds: int, calls: int = 1) -> tuple[float, float]:
+    """Median wall times [s] of two things that take turns, so that whatever else the machine does meets both.
+
+    Every round is ``calls`` calls of ``measured`` and one of ``baseline``; one of each, before all, is not counted.
+    """
+    taken: tuple[list[float], list[float]] = ([], [])
+    measured()
+    baseline()
+    for _ in range(rounds):
+        for run, times, count in ((measured, taken[0], calls), (baseline, taken[1], 1)):
+            for _ in range(count):
+                started = time.perf_counter()
+                run()
+                times.append(time.perf_counter() - started)
+    return float(np.median(taken[0])), float(np.median(taken[1]))
 
 
 def talk_size_sector(seed: int) -> Sector:
@@ -109,7 +118,7 @@ def daylight() -> RelightInput:
     return RelightInput(np.full((SKY_PATCHES, 3), (1.2e4, 1.4e4, 1.8e4), np.float32), sun)
 
 
-def bench_relight(device: Device, repeats: int = 200) -> Measurement:
+def bench_relight(device: Device, rounds: int = 15) -> Measurement:
     """One tick's relight of two sectors, host overhead included: sun, sky and one bounce. Baseline: the NumPy twin in float32."""
     given, relighter = daylight(), Relighter(device)
     residents = [ResidentSector(device, talk_size_sector(seed), SKY_PATCHES) for seed in range(ROTATION)]
@@ -125,14 +134,14 @@ def bench_relight(device: Device, repeats: int = 200) -> Measurement:
         for resident in residents[:2]:
             relight_twin.relight(resident.sector, given, resident.read_cubes(), 1)
 
-    milliseconds, baseline = seconds(tick, repeats) * 1e3, seconds(twin, 9) * 1e3
+    milliseconds, baseline = (1e3 * s for s in side_by_side(tick, twin, rounds, calls=20))
     sizes = {"sectors": 2, "probes": TALK_PROBES, "surfels": TALK_SURFELS, "factors": TALK_FACTORS}
     return Measurement(
         "relight_two_sectors", milliseconds, "ms", baseline, baseline / milliseconds, sizes, device.name, "NumPy twin, float32"
     )
 
 
-def bench_volume(device: Device, repeats: int = 100) -> Measurement:
+def bench_volume(device: Device, rounds: int = 100) -> Measurement:
     """Filling the volume from four lit sectors, on the device. Baseline: copying as many bytes in memory."""
     resident = ResidentSector(device, talk_size_sector(0), SKY_PATCHES)
     resident.write_cubes(np.random.default_rng(0).uniform(0, 1e4, (TALK_PROBES, 6, 3)).astype(np.float32))
@@ -154,13 +163,13 @@ def bench_volume(device: Device, repeats: int = 100) -> Measurement:
         device.queue.finish()
 
     copy = values.copy()
-    milliseconds, baseline = seconds(fill, repeats) * 1e3, seconds(lambda: np.copyto(copy, values), repeats) * 1e3
+    milliseconds, baseline = (1e3 * s for s in side_by_side(fill, lambda: np.copyto(copy, values), rounds))
     return Measurement(
         "volume_fill", milliseconds, "ms", baseline, baseline / milliseconds, {"bytes": values.nbytes}, device.name, "memcpy"
     )
 
 
-def bench_decode(device: Device, repeats: int = 30) -> Measurement:
+def bench_decode(device: Device, rounds: int = 30) -> Measurement:
     """From a sector's file in memory to its buffers on the device. Baseline: decompressing the same bytes and no more."""
     import zstandard
 
@@ -171,14 +180,16 @@ def bench_decode(device: Device, repeats: int = 30) -> Measurement:
         device.queue.finish()
 
     payload = data[data.index(b"\x28\xb5\x2f\xfd") :]
-    milliseconds = seconds(decode, repeats) * 1e3
-    baseline = seconds(lambda: zstandard.ZstdDecompressor().decompress(payload), repeats) * 1e3
+    alone = zstandard.ZstdDecompressor()
+    milliseconds, baseline = (1e3 * s for s in side_by_side(decode, lambda: alone.decompress(payload), rounds))
     return Measurement(
         "sector_decode", milliseconds, "ms", baseline, baseline / milliseconds, {"bytes": len(data)}, device.name, "zstd alone"
     )
 
 
-def run(device_name: str | None = None) -> list[Measurement]:
-    """All measurements of this module on one device. Raises DeviceError."""
+def run(device_name: str | None = None, quick: bool = False) -> list[Measurement]:
+    """All measurements of this module on one device; ``quick`` ones are a look, not a result. Raises DeviceError."""
     device = shared_device(device_name)
+    if quick:
+        return [bench_relight(device, 2), bench_volume(device, 10), bench_decode(device, 3)]
     return [bench_relight(device), bench_volume(device), bench_decode(device)]

@@ -1,6 +1,5 @@
 """The HTTP application: routes, problems, the viewer page. Built by a function, so that a process can serve any dataset."""
 
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from fastapi import Depends, FastAPI
@@ -14,6 +13,7 @@ from server.head_requests import HeadRequests
 from server.routes import distant, health, lighting, preview, probes, sectors, volume, world
 from server.service import Service
 from server.settings import Settings
+from server.version import program_version
 
 VIEWER = Path(__file__).parent / "viewer"
 
@@ -27,7 +27,7 @@ def app_of(service: Service) -> FastAPI:
     """An application on top of an open service."""
     app = FastAPI(
         title="Sectorlight",
-        version=_version(),
+        version=program_version(),
         summary="Dynamic global illumination of a baked city, at any hour and weather",
         description="Errors are `application/problem+json` with a stable `code`. World frame: metres, Y up, X east, Z south.",
         dependencies=[Depends(refuse_repeated_parameters)],
@@ -46,10 +46,3 @@ def app_of(service: Service) -> FastAPI:
         return FileResponse(VIEWER / "index.html", headers={"Cache-Control": "no-cache"})
 
     return app
-
-
-def _version() -> str:
-    try:
-        return version("sectorlight")
-    except PackageNotFoundError:  # run from a checkout that is not installed
-        return "0+unknown"

@@ -5,14 +5,20 @@ Exit status: 0 done; 2 the user's input is wrong; 1 our failure; 130 interrupted
 
 import re
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NoReturn
 
 import typer
 
 from gi_core.errors import FormatError, InputError, SectorlightError, SectorMissingError
+from server.version import program_version
 
 INTERRUPTED = 130  # 128 + SIGINT, what a shell expects
+# Names of the contract that no baker makes yet.
+LATER_PRESETS = ("standard", "reference")
+BENCH_SOURCE = "procedural:midtown?blocks=1x1&seed=1"
 
 app = typer.Typer(
     help="Dynamic global illumination of a city: bake once, serve its light at any hour and weather.",
@@ -22,6 +28,7 @@ app = typer.Typer(
 )
 
 SectorRange = tuple[tuple[int, int], tuple[int, int]]
+DeviceOption = Annotated[str | None, typer.Option(envvar="SECTORLIGHT_DEVICE", help="Part of an OpenCL device's name.")]
 
 
 def main() -> None:
@@ -32,20 +39,36 @@ def main() -> None:
         fail(str(error.args[0]) if error.args else error.code, 2)
     except SectorlightError as error:
         fail(str(error), 1)
-    except KeyboardInterrupt:
-        fail("interrupted", INTERRUPTED)
+    except OSError as error:
+        fail(describe(error), 1)
 
 
-def fail(message: str, status: int) -> None:
+def fail(message: str, status: int) -> NoReturn:
     """One line on stderr, then exit."""
     print(f"sectorlight: {' '.join(message.split())}", file=sys.stderr)
     sys.exit(status)
 
 
-def parse_sectors(text: str | None) -> SectorRange | None:
+def describe(error: OSError, where: Path | None = None) -> str:
+    """What the system refused and why. A full disk names no path: then it is ``where``."""
+    path = where if error.filename is None else error.filename
+    reason = error.strerror or str(error)
+    return reason if path is None else f"{path}: {reason}"
+
+
+@contextmanager
+def writing(output: Path | None) -> Iterator[None]:
+    """Names ``output`` in errors of the system that name no path themselves."""
+    try:
+        yield
+    except SectorlightError:  # some are OSErrors too, and have their own words
+        raise
+    except OSError as error:
+        fail(describe(error, output), 1)
+
+
+def parse_sectors(text: str) -> SectorRange:
     """``X0:X1,Z0:Z1``, half open -> ((X0, X1), (Z0, Z1)); InputError when it is anything else or empty."""
-    if text is None:
-        return None
     match = re.fullmatch(r"(-?\d{1,6}):(-?\d{1,6}),(-?\d{1,6}):(-?\d{1,6})", text.replace(" ", ""))
     if not match:
         raise InputError(f"--sectors: expected X0:X1,Z0:Z1 as in --sectors=-2:3,0:4, found {text[:60]!r}")
@@ -55,22 +78,48 @@ def parse_sectors(text: str | None) -> SectorRange | None:
     return (x0, x1), (z0, z1)
 
 
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(f"sectorlight {program_version()}")
+        raise typer.Exit
+
+
+@app.callback()
+def _program(
+    version: Annotated[bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")] = False,
+) -> None:
+    pass
+
+
 @app.command()
 def bake(
     source: Annotated[
         str, typer.Argument(help=".glb .gltf .obj .ply .geojson .city.json world.toml, or procedural:midtown?blocks=8x8&seed=1")
     ],
     output: Annotated[Path, typer.Option("--output", "-o", help="The dataset's folder.")],
-    quality: Annotated[str, typer.Option(help="Preset: draft or talk, the 2016 method as the slides give it.")] = "talk",
+    quality: Annotated[
+        str, typer.Option(help="Preset: talk, the 2016 method as its slides give it, or draft, coarser and quicker.")
+    ] = "talk",
     jobs: Annotated[int, typer.Option(min=0, max=1024, help="Processes; 0 means one per core.")] = 0,
     sectors: Annotated[str | None, typer.Option(help="X0:X1,Z0:Z1, half open; sector (i, j) covers [64 i, 64 i + 64) m.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Same source, settings and seed give the same bytes.")] = 0,
     restart: Annotated[bool, typer.Option("--restart/--resume", help="Bake finished sectors again, or keep them.")] = False,
 ) -> None:
-    """Bake a city into a dataset."""
-    from bake_jobs.runner import bake as run
+    """Bake a city into a dataset. Interrupted with Ctrl-C, it keeps the sectors that are finished, and the same command bakes the rest."""
+    if quality in LATER_PRESETS:
+        raise InputError(f"--quality {quality}: comes with a later version; this one bakes draft and talk")
+    if output.exists() and not output.is_dir():
+        raise InputError(f"--output {output}: expected a folder, or a name for a new one; found a file")
+    chosen = None if sectors is None else parse_sectors(sectors)
+    try:
+        from bake_jobs.runner import bake as run
 
-    run(source, output, quality, jobs, parse_sectors(sectors), seed, restart)
+        with writing(output):
+            run(source, output, quality, jobs, chosen, seed, restart)
+    except KeyboardInterrupt:
+        kept = sum(1 for _ in output.glob("sectors/*.gisec"))
+        again = " (without --restart)" if restart else ""
+        fail(f"interrupted; {output} holds {kept} finished sectors, and the same command{again} bakes the rest", INTERRUPTED)
 
 
 @app.command()
@@ -94,7 +143,7 @@ def serve(
         str, typer.Option(envvar="SECTORLIGHT_HOST", help="Address to listen on; beyond loopback needs --token-file.")
     ] = "127.0.0.1",
     port: Annotated[int, typer.Option(envvar="SECTORLIGHT_PORT", min=0, max=65535, help="0 takes a free one.")] = 8000,
-    device: Annotated[str | None, typer.Option(envvar="SECTORLIGHT_DEVICE", help="Part of an OpenCL device's name.")] = None,
+    device: DeviceOption = None,
     token_file: Annotated[Path | None, typer.Option(envvar="SECTORLIGHT_TOKEN_FILE", help="File with the bearer token of writes.")] = None,
 ) -> None:
     """Serve a dataset over HTTP."""
@@ -102,6 +151,71 @@ def serve(
     from server.settings import Settings
 
     run(dataset, Settings(host=host, port=port, device=device, token_file=token_file))
+
+
+@app.command()
+def compare(
+    dataset: Annotated[Path, typer.Argument(help="A baked dataset's folder.")],
+    states: Annotated[
+        str, typer.Option(help="Comma-separated: noon, low_sun, overcast, or NAME=TIME/WEATHER as in dusk=20:45/partly_cloudy.")
+    ] = "noon,low_sun,overcast",
+    sectors: Annotated[str, typer.Option(help="X0:X1,Z0:Z1 (half open), a number of sectors to draw at random, or all.")] = "9",
+    points: Annotated[
+        int, typer.Option(min=1, max=100_000, help="Points of each kind per sector; more: less chance in the figures.")
+    ] = 100,
+    samples: Annotated[int, typer.Option(min=16, max=1 << 20, help="Paths per reference value; more: less noise, as 1 / sqrt.")] = 4096,
+    seed: Annotated[int, typer.Option(min=0, help="Of points, paths and the draw of sectors.")] = 0,
+    source: Annotated[
+        str | None, typer.Option(help="What was baked, wanted when --sectors of the bake left out what surrounds these sectors.")
+    ] = None,
+    json_path: Annotated[Path | None, typer.Option("--json", metavar="OUT", help="Write the report here.")] = None,
+    plot_path: Annotated[Path | None, typer.Option("--plot", metavar="OUT.png", help="Draw medians and 95th percentiles here.")] = None,
+    device: DeviceOption = None,
+) -> None:
+    """Measure a dataset's error against the path tracer: at probes, at voxels, and at shaded points as a client samples them."""
+    from bake_jobs import cli_compare
+
+    chosen = cli_compare.sectors_of(dataset, parse_sectors(sectors) if ":" in sectors else sectors, seed)
+    try:
+        with writing(json_path or plot_path):
+            cli_compare.run(dataset, cli_compare.split_states(states), chosen, points, samples, seed, source, json_path, plot_path, device)
+    except KeyboardInterrupt:
+        fail("interrupted; nothing was written", INTERRUPTED)
+
+
+@app.command()
+def bench(
+    json_path: Annotated[Path | None, typer.Option("--json", metavar="OUT", help="Write the measurements here.")] = None,
+    device: DeviceOption = None,
+    quick: Annotated[bool, typer.Option("--quick", help="A few repeats of each: shows that all works, not how fast.")] = False,
+) -> None:
+    """Time relighting, volume, decoding, baking and HTTP, each beside its baseline in the same run."""
+    from tempfile import TemporaryDirectory
+
+    from rich.console import Console
+
+    import bake_jobs.bench
+    import gi_core.bench
+    import server.bench
+    from bake_jobs.runner import bake as run_bake
+    from server import cli_bench
+
+    if json_path is not None:
+        cli_bench.check_output(json_path)
+    try:
+        with writing(json_path), Console(stderr=True).status("relight, volume, decode") as status:
+            measured = gi_core.bench.run(device, quick)
+            status.update("bake")
+            measured.append(bake_jobs.bench.bench_bake(1 if quick else 5))
+            status.update("http")
+            with TemporaryDirectory(prefix="sectorlight-bench-") as folder:
+                run_bake(BENCH_SOURCE, Path(folder) / "city", "draft", 1, console=Console(quiet=True))
+                measured.append(server.bench.bench_http(Path(folder) / "city", device, *((2, 20) if quick else ())))
+        cli_bench.show(measured)
+        if json_path is not None:
+            cli_bench.write_json(json_path, measured)
+    except KeyboardInterrupt:
+        fail("interrupted; nothing was written", INTERRUPTED)
 
 
 if __name__ == "__main__":

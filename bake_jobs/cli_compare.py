@@ -1,0 +1,108 @@
+"""``sectorlight compare``: options to ``compare_dataset``, its progress, and the report as a table, JSON and a chart."""
+
+import io
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from bake_jobs.compare import choose_sectors, compare_dataset
+from bake_jobs.compare_report import draw_chart, report_table, write_json
+from bake_jobs.scene_source import load_scene
+from gi_core.container import write_atomic
+from gi_core.dataset import Dataset
+from gi_core.errors import InputError
+from gi_core.grid import SectorIndex
+
+SectorRange = tuple[tuple[int, int], tuple[int, int]]
+REPORT_WIDTH = 120  # where no terminal says how wide it is
+
+
+def run(
+    dataset_path: Path,
+    states: Sequence[str],
+    sectors: Sequence[SectorIndex] | None,
+    points: int,
+    samples: int,
+    seed: int,
+    source: str | None,
+    json_path: Path | None,
+    plot_path: Path | None,
+    device: str | None,
+) -> None:
+    """Measure, print the table on stdout, and write what was asked for. Raises as ``compare_dataset`` and ``load_scene`` do."""
+    if plot_path is not None and plot_path.suffix.lower() != ".png":
+        raise InputError(f"--plot {plot_path}: expected a name that ends in .png")
+    for path in (json_path, plot_path):
+        # An hour of path tracing must not be lost to a typing mistake.
+        if path is not None and (path.is_dir() or not path.absolute().parent.is_dir()):
+            raise InputError(f"{path}: expected a file in a folder that exists")
+    scene = None if source is None else load_scene(source)
+    with Progress(
+        TextColumn("comparing"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        TextColumn("{task.description}"),
+        console=Console(stderr=True),
+        transient=True,
+    ) as progress:
+        task = progress.add_task("", total=None)
+
+        def advance(done: int, steps: int, what: str) -> None:
+            progress.update(task, completed=done, total=steps, description=what)
+
+        report = compare_dataset(
+            dataset_path,
+            states,
+            sectors=sectors,
+            points_per_sector=points,
+            samples=samples,
+            seed=seed,
+            device=device,
+            scene=scene,
+            progress=advance,
+        )
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=REPORT_WIDTH)
+    console.print(report_table(report))
+    if json_path is not None:
+        write_json(json_path, report)
+    if plot_path is not None:
+        picture = io.BytesIO()
+        draw_chart(report).save(picture, "PNG")
+        write_atomic(plot_path, picture.getvalue())
+
+
+def split_states(text: str) -> list[str]:
+    """``noon,dusk=20:45/clear:haze=0.5,snow=0`` -> one text per state: a weather's own commas do not part states."""
+    states: list[str] = []
+    for part in text.split(","):
+        # Only a weather's numbers have = without the / that a state's moment has.
+        if states and "=" in part and "/" not in part:
+            states[-1] += f",{part}"
+        else:
+            states.append(part)
+    return states
+
+
+def sectors_of(dataset_path: Path, chosen: str | SectorRange, seed: int) -> list[SectorIndex]:
+    """The sectors of a dataset that are meant by ``all``, a number of them, or half-open ranges. Raises InputError when there is none."""
+    dataset = Dataset.open(dataset_path)
+    known = sorted(dataset.world.sectors)
+    if isinstance(chosen, tuple):
+        (x0, x1), (z0, z1) = chosen
+        found = [i for i in known if x0 <= i.x < x1 and z0 <= i.z < z1]
+        if not found:
+            raise InputError(f"--sectors={x0}:{x1},{z0}:{z1}: {dataset_path} has no sector there; `sectorlight info` shows its extent")
+        return found
+    if chosen == "all":
+        return known
+    if not re.fullmatch(r"[1-9]\d{0,6}", chosen):
+        raise InputError(f"--sectors: expected X0:X1,Z0:Z1, a number of sectors, or all; found {chosen[:60]!r}")
+    return choose_sectors(dataset, seed, int(chosen))
