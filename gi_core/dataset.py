@@ -148,7 +148,7 @@ class WorldInfo:
             sky_patches=top.integer("sky_patches", len(CUBE_FACES), len(CUBE_FACES)),
             settings=top.mapping("settings"),
             seed=top.integer("seed"),
-            sun_table=SunTable.from_json(record["sun_table"]),
+            sun_table=_sun_table(record["sun_table"], where),
             sectors=_sectors(top),
             rooms=tuple(_room(Fields(r, f"{where}: rooms", Room.__dataclass_fields__)) for r in top.sequence("rooms", MAX_ROOMS)),
             lamps=tuple(_lamp(Fields(r, f"{where}: lamps", Lamp.__dataclass_fields__)) for r in top.sequence("lamps", MAX_LAMPS)),
@@ -182,6 +182,13 @@ def _corners(top: Fields) -> tuple[tuple[float, float, float], tuple[float, floa
     if len(corners) != 2 or any(low > high for low, high in zip(*corners, strict=True)):
         raise CorruptFileError(f"{top.where}: bounds: expected a minimum and a maximum, found {corners}; bake it again")
     return corners[0], corners[1]
+
+
+def _sun_table(record: Any, where: str) -> SunTable:
+    try:
+        return SunTable.from_json(record)
+    except CorruptFileError as error:
+        raise CorruptFileError(f"{where}: {error}") from error
 
 
 def _location(place: Fields) -> Location:

@@ -1,0 +1,269 @@
+"""world.json is not trusted: whatever is in it, a dataset opens right or is refused by name, with one clear line."""
+
+import contextlib
+import copy
+import json
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from gi_core.dataset import MAX_WORLD_BYTES, Dataset, WorldInfo, write_world
+from gi_core.errors import CorruptFileError, FormatError, FormatVersionError, InputError, SectorlightError
+from gi_core.grid import SectorIndex
+from server.cli import main
+
+GOLDEN = Path(__file__).parents[1] / "golden" / "v1"
+RECORD: dict[str, Any] = json.loads((GOLDEN / "world.json").read_bytes())
+
+
+def at(*path: Any, **change: Any) -> dict[str, Any]:
+    """The golden record with the member at ``path`` set to ``to``, or removed."""
+    record = copy.deepcopy(RECORD)
+    parent = record
+    for step in path[:-1]:
+        parent = parent[step]
+    if change:
+        parent[path[-1]] = change["to"]
+    else:
+        del parent[path[-1]]
+    return record
+
+
+def read(record: Any) -> WorldInfo:
+    """A record, by way of its text: what JSON can't carry must not reach the test."""
+    return WorldInfo.from_json(json.loads(json.dumps(record)), "city/world.json")
+
+
+def test_what_is_written_is_what_is_read(tmp_path):
+    world = read(RECORD)
+    assert json.loads(json.dumps(world.to_json())) == RECORD
+    write_world(tmp_path, world)
+    assert (tmp_path / "world.json").read_bytes() == (GOLDEN / "world.json").read_bytes()
+    assert world.sectors[SectorIndex(-1, 0)].probes == RECORD["sectors"]["-1,0"]["probes"]
+    assert world.counts["probes"] == sum(facts["probes"] for facts in RECORD["sectors"].values())
+
+
+@pytest.mark.parametrize("version", [0, 2, 999])
+def test_another_version_is_named_and_says_what_to_do(version):
+    with pytest.raises(FormatVersionError, match=rf"city/world\.json: dataset version {version}, .* version 1; bake it again"):
+        read(at("version", to=version))
+
+
+def test_info_exits_with_2_and_one_line_for_another_version(tmp_path, monkeypatch, capsys):
+    (tmp_path / "world.json").write_text(json.dumps(at("version", to=7)))
+    monkeypatch.setattr(sys, "argv", ["sectorlight", "info", str(tmp_path)])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    out, err = capsys.readouterr()
+    assert (ended.value.code, out) == (2, "")
+    assert err.count("\n") == 1
+    assert "version 7" in err
+    assert "bake it again" in err
+
+
+MEMBERS = [
+    *((name,) for name in RECORD if name not in ("format", "version")),
+    *(("location", name) for name in RECORD["location"]),
+    *(("sectors", "0,0", name) for name in RECORD["sectors"]["0,0"]),
+    *(("rooms", 0, name) for name in RECORD["rooms"][0]),
+    *(("lamps", 0, name) for name in RECORD["lamps"][0]),
+    *(("sun_table", name) for name in RECORD["sun_table"]),
+]
+
+
+@pytest.mark.parametrize("path", MEMBERS, ids=lambda path: ".".join(map(str, path)))
+def test_a_member_that_is_missing_or_of_another_type_is_refused_by_name(path):
+    with pytest.raises(CorruptFileError, match=str(path[-1])):
+        read(at(*path))
+    # No member may be a list of lists of booleans, or true.
+    for wrong in ([[True]], True):
+        with pytest.raises(CorruptFileError):
+            read(at(*path, to=wrong))
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        (("bounds",), [[0, 0, 0], [float("nan"), 1, 1]]),
+        (("bounds",), [[0, 0, 0], [float("inf"), 1, 1]]),
+        (("bounds",), [[0, 0, 0]]),
+        (("bounds",), [[0, 0, 0]] * 3),
+        (("bounds",), [[0, 0], [1, 1]]),
+        (("bounds",), [[2, 0, 0], [1, 1, 1]]),
+        (("bounds",), [[0, 0, 0], [10**400, 1, 1]]),
+        (("basis",), "sh9"),
+        (("sky_patches",), 1_000_000_000),
+        (("sky_patches",), -1),
+        (("sky_patches",), float("inf")),
+        (("seed",), -1),
+        (("seed",), 1.5),
+        (("name",), "\ud800"),
+        (("name",), "x" * 5000),
+        (("unheard_of",), 1),
+        (("settings",), {"knob": float("nan")}),
+        (("error_report",), []),
+        (("error_report",), {"expected_error": "small"}),
+        (("error_report",), {"deep": [float("inf")]}),
+        (("location", "latitude_degrees"), 91),
+        (("location", "longitude_degrees"), float("nan")),
+        (("location", "timezone"), "Mars/Olympus"),
+        (("location", "timezone"), "../../etc/passwd"),
+        (("location", "date"), "2024-02-30"),
+        (("sun_table", "planes"), 22),
+        (("sun_table", "declination_step_degrees"), 0),
+        (("rooms", 0, "minimum"), [0, 0]),
+        (("rooms", 0, "maximum"), [0, 0, float("inf")]),
+        (("rooms",), [[]]),
+        (("lamps", 0, "lumens"), -1),
+        (("lamps", 0, "color"), [1, 1, float("nan")]),
+        (("lamps", 0, "extra"), 1),
+        (("dropped_triangles", "degenerate"), -3),
+        (("sectors", "0,0", "probes"), -1),
+        (("sectors", "0,0", "probes"), "20"),
+        (("sectors", "0,0", "extra"), 1),
+        *((("sectors", key), RECORD["sectors"]["0,0"]) for key in ("0", "0,", "0,0,0", "a,b", "1_0,0", " 1,0", "01,0", "-0,0", "1.0,0")),
+        *((("sectors", key), RECORD["sectors"]["0,0"]) for key in ("\u0661,0", "1000001,0", "9" * 400 + ",0", "")),
+    ],
+)
+def test_a_value_out_of_its_range_is_refused_by_name(path, value):
+    with pytest.raises(CorruptFileError, match=r"city/world\.json"):
+        read(at(*path, to=value))
+
+
+@pytest.mark.parametrize("version", [True, "1", 1.5, None, [], 10**400])
+def test_a_version_that_is_no_number_is_refused(version):
+    with pytest.raises(FormatError):
+        read(at("version", to=version))
+
+
+@pytest.mark.parametrize("record", [[], {}, None, 3, "sectorlight-dataset", {"format": "other"}])
+def test_what_is_no_dataset_says_how_to_make_one(record):
+    with pytest.raises(InputError, match="sectorlight bake"):
+        read(record)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"",
+        b"{",
+        b"\xff\xfe",
+        b"[" * 100_000,
+        b'{"format": ' * 20_000,
+        b"9" * 5000,
+        b'{"format":"sectorlight-dataset","version":' + b"1" * 5000 + b"}",
+    ],
+    ids=["empty", "cut off", "not UTF-8", "deep list", "deep object", "long number", "long version"],
+)
+def test_a_file_that_is_no_json_is_refused_by_name(tmp_path, text):
+    (tmp_path / "world.json").write_bytes(text)
+    with pytest.raises(CorruptFileError, match=r"world\.json"):
+        Dataset.open(tmp_path)
+
+
+def test_a_huge_file_is_refused_before_it_is_read(tmp_path, monkeypatch):
+    with (tmp_path / "world.json").open("wb") as file:
+        file.truncate(MAX_WORLD_BYTES + 1)  # sparse: takes no disk
+
+    def never(_: Path) -> bytes:
+        raise AssertionError("read")
+
+    monkeypatch.setattr(Path, "read_bytes", never)
+    with pytest.raises(CorruptFileError, match=f"at most {MAX_WORLD_BYTES} bytes, found {MAX_WORLD_BYTES + 1}"):
+        Dataset.open(tmp_path)
+
+
+def test_more_sectors_than_the_limit_are_refused(monkeypatch):
+    monkeypatch.setattr("gi_core.dataset.MAX_SECTORS", 1)
+    with pytest.raises(CorruptFileError, match="at most 1 sectors, found 2"):
+        read(RECORD)
+
+
+@pytest.mark.parametrize("name", ["missing", "empty"])
+def test_a_folder_without_world_json_says_what_was_expected(tmp_path, name):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match=rf"{name}: no world\.json here; expected a folder that `sectorlight bake` wrote"):
+        Dataset.open(tmp_path / name)
+
+
+JSON_LEAVES = (
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats()
+    | st.text(max_size=8)
+    | st.sampled_from([10**400, -(10**20), 1e308, "9" * 50, "\ud800", "NaN", "", {}, [], "0,0", 2**63])
+)
+JSON_VALUES = st.recursive(JSON_LEAVES, lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=6), inner, max_size=4))
+
+
+def every_place(record: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """Paths of all members and items of a record."""
+    steps = list(record) if isinstance(record, dict) else range(len(record)) if isinstance(record, list) else []
+    return [place for step in steps for place in ((*path, step), *every_place(record[step], (*path, step)))]
+
+
+PLACES = every_place(RECORD)
+
+
+@settings(max_examples=400, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(st.lists(st.tuples(st.sampled_from(PLACES), JSON_VALUES, st.sampled_from(["set", "remove", "add"])), min_size=1, max_size=3))
+def test_no_change_of_world_json_gives_a_traceback(changes):
+    record = copy.deepcopy(RECORD)
+    for path, value, action in changes:
+        parent = record
+        try:
+            for step in path[:-1]:
+                parent = parent[step]
+            if action == "remove":
+                del parent[path[-1]]
+            elif action == "add" and isinstance(parent, dict):
+                parent[f"{path[-1]}!"] = value
+            else:
+                parent[path[-1]] = value
+        except (KeyError, IndexError, TypeError):
+            continue  # an earlier change took this place away
+    refusal, world = None, None
+    try:
+        world = read(record)
+    except SectorlightError as error:
+        refusal = str(error)
+    if world is None:
+        assert refusal
+        assert "\n" not in refusal
+        assert len(refusal) < 1000
+        return
+    # What is accepted can be used and written again, as strict JSON that reads back the same.
+    assert world.counts["sectors"] == len(world.sectors)
+    text = json.dumps(world.to_json(), allow_nan=False)
+    text.encode()
+    assert read(json.loads(text)).to_json() == world.to_json()
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2200), st.binary(min_size=1, max_size=4))
+def test_no_damage_to_the_text_gives_a_traceback(place, octets):
+    text = (GOLDEN / "world.json").read_bytes()
+    damaged = text[:place] + octets + text[place + len(octets) :]
+    try:
+        record = json.loads(damaged)
+    except ValueError:
+        return  # Dataset.open turns these into CorruptFileError: tested above
+    with contextlib.suppress(SectorlightError):
+        WorldInfo.from_json(record, "here")
+
+
+def test_an_unreadable_file_is_the_users_to_mend(tmp_path, monkeypatch):
+    shutil.copy(GOLDEN / "world.json", tmp_path)
+
+    def denied(_: Path) -> bytes:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "read_bytes", denied)
+    with pytest.raises(InputError, match="Permission denied"):
+        Dataset.open(tmp_path)
