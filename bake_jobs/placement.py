@@ -25,9 +25,13 @@ FLOOR_MIN_UP = 0.3
 WALL_MAX_UP = 0.5
 # A probe this close to a surface would see little else; it is pushed away from what stands at its side.
 CLEARANCE_M = 0.5
+PULL_M = (0.011, 0.007)
 # A wall probe closer than this to a probe that stands already would tell nothing new.
 WALL_MIN_DISTANCE_M = 3.0
 SAME_PLACE_M = 1.0
+# Cube-map rays run in ratios of odd numbers, and so do offsets from tidy walls: a ray from 0.5 m off a wall and 1.5 m up meets the very
+# edge where wall and floor join, and may report the floor behind. A few millimetres, in no such ratio, and no ray does.
+OFF_EDGES_M = (0.0037, 0.0053, 0.0029)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +86,7 @@ def place_probes(
     order = np.lexsort((position[:, 0], position[:, 2], position[:, 1], flags & PROBE_ON_WALL, flags & PROBE_IN_MARGIN))
     chosen = np.sort(order[:MAX_PROBES_PER_SECTOR])
     position, flags, room = position[chosen], flags[chosen], room[chosen]
+    position = position + np.array(OFF_EDGES_M)
     # Stored along a curve of place, so that neighbours in memory are neighbours in space: their factors compress and cache well.
     order = np.lexsort((position[:, 1], position[:, 0] // 8, position[:, 2] // 8))
     return Placement(position[order], flags[order], room[order], dead_count, max(0, len(in_sector) - MAX_PROBES_PER_SECTOR))
@@ -141,13 +146,15 @@ def _ground_candidates(ray_scene: RayScene, bounds: Float64, low: Float64, high:
     height = np.minimum(settings.probe_height_m, free[roomy] / 2)
     position = at[roomy].copy()
     position[:, 1] += height
-    return _pushed_off(ray_scene, position)
+    return _pushed_off(ray_scene, position, np.array([PULL_M[0], 0.0, PULL_M[1]]))
 
 
-def _pushed_off(ray_scene: RayScene, position: Float64) -> Float64:
-    """Positions (n, 3) [m] moved sideways until CLEARANCE_M from what stands beside them, as far as there is room."""
-    # Lattice and walls share whole metres: a point in a wall's own plane is pulled to one side of it before it looks around.
-    position = position + np.array([0.011, 0.0, 0.007])
+def _pushed_off(ray_scene: RayScene, position: Float64, pull: Float64) -> Float64:
+    """Positions (n, 3) [m] moved sideways until CLEARANCE_M from what stands beside them, as far as there is room.
+
+    Lattice and walls share whole metres: a point in a wall's own plane is first moved by ``pull`` (3,) or (n, 3) [m], to one side of it.
+    """
+    position = position + pull
     for azimuth in np.radians(np.arange(8) * 45.0):
         direction = np.array([np.cos(azimuth), 0.0, np.sin(azimuth)])
         ahead = ray_scene.closest(position, np.tile(direction.astype(np.float32), (len(position), 1)))
@@ -188,7 +195,8 @@ def _wall_candidates(ray_scene: RayScene, bounds: Float64, low: Float64, high: F
     # In a gap narrower than twice the offset the probe stands in the middle.
     offset = np.minimum(settings.wall_offset_m, np.minimum(air.distance, 1e6) / 2)
     fits = offset > 0.3
-    position = at[fits] + normal[fits] * offset[fits, None]
+    along_wall = np.stack([-normal[fits, 2], np.zeros(int(fits.sum())), normal[fits, 0]], axis=1)
+    position = _pushed_off(ray_scene, at[fits] + normal[fits] * offset[fits, None], PULL_M[0] * along_wall)
     # In an order of place, not of the rays, which start elsewhere for every sector. To the centimetre: rays are rounded.
     order = np.lexsort(np.round(position * 100).T[[0, 2, 1]])
     return position[order]

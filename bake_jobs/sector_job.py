@@ -56,7 +56,8 @@ class SectorBaker:
         scene, settings, rays = self._scene, self._settings, self._rays
         placed = placement.place_probes(rays, self._solids, scene.bounds, index, settings, scene.rooms, scene.hints)
         seen = gbuffer.render(rays, placed.position, self._pattern)
-        clustered = surfels.cluster(seen, index.origin, scene.albedo, scene.emission, settings.cells_double_beyond_m)
+        room = surfels.rooms_of_hits(seen, placed.room, scene.rooms)
+        clustered = surfels.cluster(seen, room, index.origin, scene.albedo, scene.emission, settings.cells_double_beyond_m)
         weights = factors.gather(seen, self._pattern, clustered)
         feedback_probe, feedback_weight = surfels.feedback(clustered, seen, settings.feedback_probes)
         heights = geometry.vertices[:, 1] if len(geometry.vertices) else np.zeros(1)

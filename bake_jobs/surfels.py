@@ -1,10 +1,13 @@
 """Clusters what probes see into surfels and bricks (slides "Surfel sharing", "Surfel grid"): a two-level hash grid.
 
-A hit's key names its brick's cell, its principal normal direction, and its own cell inside the brick, in that order of significance.
-Sorting by the key therefore sorts surfels by brick, and a brick is a run of surfels:
+A hit's key names its brick's cell, its room, its principal normal direction, and its own cell inside the brick, in that order of
+significance. Sorting by the key therefore sorts surfels by brick, and a brick is a run of surfels:
 
-    key = [level | brick y | brick z | brick x | direction | cell in brick]
-           3 bit    16 bit    16 bit    16 bit     3 bit        6 bit
+    key = [level | brick y | brick z | brick x | room  | direction | cell in brick]
+           3 bit    13 bit    16 bit    16 bit   6 bit     3 bit        6 bit
+
+The direction keeps the two faces of a thin wall apart, the room what stands on the floor at either side of it: a brick of 4 m that
+lay under the wall between two rooms would carry the light of one into the other.
 
 Cells are 1 m and bricks 4 m wide at level 0, and twice as wide at each next level. A 1 m cell goes to the level that the distance of
 the closest probe which sees it asks for: beyond some 10 m, the rays of a 16 x 16 face fall further apart than 1 m, and every hit
@@ -17,14 +20,20 @@ import numpy as np
 
 from bake_jobs.gbuffer import GBuffer
 from gi_core.arrays import Float32, Float64, Int32, Int64, UInt8, UInt16
-from gi_core.constants import BRICK_CELL_M, MAX_BRICK_LEVEL, SURFEL_CELL_M
+from gi_core.constants import BRICK_CELL_M, MAX_BRICK_LEVEL, ROOM_OUTDOORS, SURFEL_CELL_M
 from gi_core.errors import SourceError
+from gi_core.world import Room
 
 CELLS_PER_BRICK = round(BRICK_CELL_M / SURFEL_CELL_M)
 # Walls and floors love whole metres. Moved this far off the surface, all their hits fall into one layer of cells, and the two faces
 # of a thin wall into different ones.
 KEY_OFFSET_M = 0.02
+# An author's box of a room may end this far before its walls.
+ROOM_SLACK_M = 0.1
 _HALF_RANGE = 1 << 15
+_HALF_HEIGHT = 1 << 12
+_ROOM_KEYS = 63  # rooms beyond share keys; two that share one share light only where one brick reaches into both
+_BRICK_SHIFT = 6  # of a surfel's key: what is left names its brick
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,9 +71,29 @@ def principal_direction(normal: Float32) -> UInt8:
     return (2 * axis + negative).astype(np.uint8)
 
 
-def cluster(gbuffer: GBuffer, origin: Float64, albedo: Float32, emission: Float32, double_beyond_m: float) -> Surfels:
+def rooms_of_hits(gbuffer: GBuffer, probe_room: UInt16, rooms: tuple[Room, ...]) -> UInt16:
+    """The room that the air before each G-buffer entry belongs to: (P * r,) uint16, 0 outdoors and where nothing was hit.
+
+    probe_room : (P,) uint16, numbers of ``rooms`` from 1. Only rooms with a probe count: a room that no probe stands in has no light
+    of its own to protect.
+    """
+    room = np.full(len(gbuffer.position), ROOM_OUTDOORS, np.uint16)
+    air = gbuffer.position + gbuffer.hits.normal * KEY_OFFSET_M
+    seen_from = np.repeat(probe_room, gbuffer.rays)
+    present = np.unique(probe_room[probe_room != ROOM_OUTDOORS])
+    for slack, of_own_probes in ((ROOM_SLACK_M, True), (0.0, False)):
+        for number in present[::-1]:
+            box = rooms[number - 1]
+            inside = ((air >= np.array(box.minimum) - slack) & (air <= np.array(box.maximum) + slack)).all(axis=1)
+            room[inside & (seen_from == number) if of_own_probes else inside] = number
+    room[~gbuffer.hits.hit] = ROOM_OUTDOORS
+    return room
+
+
+def cluster(gbuffer: GBuffer, room: UInt16, origin: Float64, albedo: Float32, emission: Float32, double_beyond_m: float) -> Surfels:
     """Group a sector's hits into surfels and bricks.
 
+    room : (P * r,) as ``rooms_of_hits`` gives it
     origin : (3,) the sector's; albedo, emission : (m, 3) of the scene's triangles
     double_beyond_m : cells are 1 m where some probe is closer than this, and double with every doubling of that distance
     """
@@ -72,10 +101,14 @@ def cluster(gbuffer: GBuffer, origin: Float64, albedo: Float32, emission: Float3
     local = gbuffer.position[hit] - origin
     normal = gbuffer.hits.normal[hit]
     direction = principal_direction(normal)
+    room_key = np.where(room[hit] == ROOM_OUTDOORS, 0, (room[hit].astype(np.int64) - 1) % _ROOM_KEYS + 1)
     cell = np.floor((local + normal * KEY_OFFSET_M) / SURFEL_CELL_M).astype(np.int64)
-    if len(cell) and np.abs(cell).max() >= _HALF_RANGE * CELLS_PER_BRICK:
-        raise SourceError(f"a probe sees a surface more than {_HALF_RANGE * BRICK_CELL_M:.0f} m away; split the world into parts")
-    fine_key, fine_of_hit = np.unique(_key(cell, direction, np.zeros(len(cell), np.int64)), return_inverse=True)
+    for axis, half in enumerate((_HALF_RANGE, _HALF_HEIGHT, _HALF_RANGE)):
+        if len(cell) and np.abs(cell[:, axis]).max() >= half * CELLS_PER_BRICK:
+            raise SourceError(
+                f"a probe sees a surface more than {half * BRICK_CELL_M:.0f} m away along {'xyz'[axis]}; split the world into parts"
+            )
+    fine_key, fine_of_hit = np.unique(_key(cell, room_key, direction, np.zeros(len(cell), np.int64)), return_inverse=True)
     fine_of_hit = fine_of_hit.reshape(-1)
     closest = np.full(len(fine_key), np.inf, np.float32)
     np.minimum.at(closest, fine_of_hit, gbuffer.hits.distance[hit])
@@ -83,7 +116,7 @@ def cluster(gbuffer: GBuffer, origin: Float64, albedo: Float32, emission: Float3
     of_fine_cell = np.empty(len(fine_key), np.int64)
     of_fine_cell[fine_of_hit] = np.arange(len(hit))  # any hit of a fine cell knows its place and direction
     coarse_cell = cell[of_fine_cell] >> level[:, None]
-    surfel_key, surfel_of_fine = np.unique(_key(coarse_cell, direction[of_fine_cell], level), return_inverse=True)
+    surfel_key, surfel_of_fine = np.unique(_key(coarse_cell, room_key[of_fine_cell], direction[of_fine_cell], level), return_inverse=True)
     of_hit = surfel_of_fine.reshape(-1)[fine_of_hit]
     count = len(surfel_key)
     hits_of_surfel = np.bincount(of_hit, minlength=count)
@@ -95,15 +128,16 @@ def cluster(gbuffer: GBuffer, origin: Float64, albedo: Float32, emission: Float3
     triangle = gbuffer.hits.triangle[hit]
     mean_normal = mean(normal)
     mean_normal /= np.maximum(np.linalg.norm(mean_normal, axis=1, keepdims=True), 1e-12)
-    brick_key, first = np.unique(surfel_key >> 6, return_index=True)
-    brick_cell = np.stack([brick_key >> 3 & 0xFFFF, brick_key >> 35 & 0xFFFF, brick_key >> 19 & 0xFFFF], axis=1) - _HALF_RANGE
+    brick_key, first = np.unique(surfel_key >> _BRICK_SHIFT, return_index=True)
+    brick_cell = np.stack([brick_key >> 9 & 0xFFFF, brick_key >> 41 & 0x1FFF, brick_key >> 25 & 0xFFFF], axis=1)
+    brick_cell -= np.array([_HALF_RANGE, _HALF_HEIGHT, _HALF_RANGE])
     return Surfels(
         position=mean(local),
         normal=mean_normal.astype(np.float32),
         albedo=mean(albedo[triangle]).astype(np.float32),
         emission=mean(emission[triangle]).astype(np.float32) if emission.any() else np.zeros((count, 3), np.float32),
         brick_starts=np.append(first, count).astype(np.int64),
-        brick_level=(brick_key >> 51).astype(np.uint8),
+        brick_level=(brick_key >> 54).astype(np.uint8),
         brick_cell=brick_cell.astype(np.int32),
         brick_direction=(brick_key & 7).astype(np.uint8),
         of_hit=of_hit,
@@ -111,13 +145,13 @@ def cluster(gbuffer: GBuffer, origin: Float64, albedo: Float32, emission: Float3
     )
 
 
-def _key(cell: Int64, direction: UInt8, level: Int64) -> Int64:
+def _key(cell: Int64, room: Int64, direction: UInt8, level: Int64) -> Int64:
     """Sort keys (n,) of surfel cells (n, 3) at their level's size; the module's docstring draws the bits."""
     brick = cell // CELLS_PER_BRICK
     within = cell - brick * CELLS_PER_BRICK
-    b = brick + _HALF_RANGE
-    key = ((level << 16 | b[:, 1]) << 16 | b[:, 2]) << 16 | b[:, 0]
-    return (key << 3 | direction) << 6 | (within[:, 1] << 4 | within[:, 2] << 2 | within[:, 0])
+    b = brick + np.array([_HALF_RANGE, _HALF_HEIGHT, _HALF_RANGE])
+    key = ((level << 13 | b[:, 1]) << 16 | b[:, 2]) << 16 | b[:, 0]
+    return ((key << 6 | room) << 3 | direction) << _BRICK_SHIFT | (within[:, 1] << 4 | within[:, 2] << 2 | within[:, 0])
 
 
 def feedback(surfels: Surfels, gbuffer: GBuffer, k: int) -> tuple[UInt16, Float32]:

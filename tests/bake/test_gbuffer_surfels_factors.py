@@ -12,6 +12,7 @@ from bake_jobs.sector_job import SKY_FACES
 from bake_jobs.surfels import KEY_OFFSET_M, principal_direction
 from gi_core.constants import BRICK_CELL_M, MAX_BRICK_LEVEL
 from gi_core.sector import check_sector, counts
+from gi_core.world import Room
 
 DOUBLE_BEYOND_M = 8.0
 # A surfel is the mean of hits that were keyed 2 cm off their surface, each good to float32's 1e-4 m in a small scene.
@@ -27,11 +28,12 @@ class Clustered:
     pattern: gbuffer.RayPattern
 
 
-def look(scene, probes, origin=(0.0, 0.0, 0.0), edge=8) -> Clustered:
+def look(scene, probes, origin=(0.0, 0.0, 0.0), edge=8, room=None) -> Clustered:
     pattern = cube_map_pattern(edge)
     probes = np.asarray(probes, np.float64)
     seen = gbuffer.render(RayScene(scene.vertices, scene.triangles), probes, pattern)
-    found = surfels.cluster(seen, np.asarray(origin, np.float64), scene.albedo, scene.emission, DOUBLE_BEYOND_M)
+    room = np.zeros(len(seen.position), np.uint16) if room is None else room(seen)
+    found = surfels.cluster(seen, room, np.asarray(origin, np.float64), scene.albedo, scene.emission, DOUBLE_BEYOND_M)
     return Clustered(probes, seen, found, pattern)
 
 
@@ -198,6 +200,40 @@ def test_the_two_faces_of_a_thin_wall_never_share_a_surfel_or_a_brick(build, thi
         assert west
         assert east
         assert not west & east
+
+
+def rooms_behind_a_wall(wall_x=33.0, gap=0.05, number=1):
+    """Authored boxes that end ``gap`` before the walls; the second is ``number`` rooms later than the first."""
+    filler = tuple(Room(f"far {i}", (900.0 + i, 0, 0), (900.5 + i, 1, 1)) for i in range(number - 1))
+    west = Room("west", (20.0, gap, 20.0), (wall_x - gap, 4.0, 44.0))
+    return (west, *filler, Room("east", (wall_x + 0.1 + gap, gap, 20.0), (50.0, 4.0, 44.0)))
+
+
+@pytest.mark.parametrize("gap", [0.0, 0.05])
+@pytest.mark.parametrize("number", [1, 2, 40])
+def test_what_stands_in_two_rooms_never_shares_a_brick(build, gap, number):
+    rooms = rooms_behind_a_wall(gap=gap, number=number)
+    scene = build().ground(low=(10, 10), high=(60, 60)).box((33.0, 0, 10), (33.1, 4, 60)).quad((10, 4, 10), (50, 0, 0), (0, 0, 50)).scene()
+    probes = np.array([[x, 1.5, z] for x in (30.0, 32.0, 34.1, 36.0) for z in (26.0, 32.0, 38.0)])
+    probe_room = np.repeat([1, 1, 1 + number, 1 + number], 3).astype(np.uint16)
+    seen = look(scene, probes, room=lambda gbuffer: surfels.rooms_of_hits(gbuffer, probe_room, rooms))
+    s = seen.surfels
+    by = probe_room[s.hit // seen.seen.rays]
+    inside = (seen.seen.position[s.hit][:, 2] > 20) & (seen.seen.position[s.hit][:, 2] < 44)
+    for group in (s.of_hit, s.brick_of_surfel[s.of_hit]):
+        west, east = (set(group[(by == room) & inside].tolist()) for room in (1, 1 + number))
+        assert min(len(west), len(east)) > 20
+        assert not west & east
+
+
+def test_the_outside_of_a_rooms_wall_is_outdoors(build):
+    room = Room("hut", (20.0, 0.0, 20.0), (30.0, 4.0, 30.0))
+    scene = build().ground(low=(0, 0), high=(64, 64)).box(room.minimum, room.maximum, without=("-y",)).scene()  # walls are sheets
+    probes = np.array([[25.0, 1.5, 25.0], [15.0, 1.5, 25.0]])
+    seen = look(scene, probes)
+    found = surfels.rooms_of_hits(seen.seen, np.array([1, 0], np.uint16), (room,)).reshape(2, -1)
+    assert (found[0] == 1).all()
+    assert not found[1].any()
 
 
 @pytest.mark.parametrize("offset", [np.zeros(3), FAR_M], ids=["at the origin", "51 km away"])

@@ -7,7 +7,7 @@ import pytest
 
 from bake_jobs.config import settings_for
 from bake_jobs.inside import Solids
-from bake_jobs.placement import Placement, place_probes, room_of
+from bake_jobs.placement import CLEARANCE_M, Placement, place_probes, room_of
 from bake_jobs.rays import RayScene
 from bake_jobs.scene import ProbeHint
 from gi_core.constants import MAX_PROBES_PER_SECTOR
@@ -16,8 +16,8 @@ from gi_core.sector import PROBE_IN_MARGIN, PROBE_ON_GROUND, PROBE_ON_WALL
 from gi_core.world import Room
 
 TALK = settings_for("talk")
-# Rays in float32 around an anchor within 32 m of every point here.
-CLOSE_M = 1e-3
+# Rays in float32 around an anchor within 32 m of every point here; and probes are moved off edges by a few millimetres.
+CLOSE_M = 6e-3
 
 
 def placed(scene, index=(0, 0), settings=TALK) -> Placement:
@@ -78,7 +78,7 @@ def test_every_storey_of_a_slab_building_gets_its_layer(build):
     p = placed(slabs.scene())
     ground = p.position[p.flags & PROBE_ON_GROUND != 0]
     ground = ground[within(ground, (8, -1, 8), (56, 20, 56))]
-    heights, count = np.unique(np.round(ground[:, 1], 2), return_counts=True)
+    heights, count = np.unique(np.round(ground[:, 1], 1), return_counts=True)
     assert dict(zip(heights.tolist(), count.tolist(), strict=True)) == {1.5: 144, 5.8: 144, 9.8: 144}
 
 
@@ -88,7 +88,11 @@ def test_wall_probes_stand_off_a_houses_walls_on_the_outside_only(build):
     wall = p.position[p.flags & PROBE_ON_WALL != 0]
     assert len(wall) >= 20
     beyond = np.maximum(np.maximum(low - wall, wall - high), 0)[:, [0, 2]]
-    np.testing.assert_allclose(beyond.max(axis=1), TALK.wall_offset_m, atol=CLOSE_M)
+    off = beyond.max(axis=1)
+    # Those in the plane of the next wall are pushed off it.
+    pushed = np.abs(off - CLEARANCE_M) < CLOSE_M
+    np.testing.assert_allclose(off[~pushed], TALK.wall_offset_m, atol=CLOSE_M)
+    assert pushed.mean() < 0.5
     for side in range(4):  # each wall has its own
         axis, sign = (0, 2)[side // 2], (-1, 1)[side % 2]
         edge = (low, high)[side % 2][axis]
@@ -218,7 +222,8 @@ def test_margin_probes_are_the_neighbours_own(build):
     west, east = placed(scene, (0, 0)), placed(scene, (1, 0))
     strip = {}
     for name, p in (("west", west), ("east", east)):
-        shared = within(p.position, (60, -10, 0), (68, 100, 64))
+        # Not the outermost metre of a margin: there, what thins a probe may itself be thinned from beyond.
+        shared = within(p.position, (61, -10, 0), (67, 100, 64))
         strip[name] = p.position[shared], p.room[shared], p.flags[shared]
     assert len(strip["west"][0]) > 40
     assert rows(strip["west"][0]) == rows(strip["east"][0])
@@ -233,7 +238,7 @@ def test_wall_probes_stand_on_both_sides_of_a_thin_wall(build):
     wall = p.position[(p.flags & PROBE_ON_WALL != 0) & (np.abs(p.position[:, 0] - 31) < 1.5)]
     west, east = wall[wall[:, 0] < 31], wall[wall[:, 0] > 31.1]
     assert len(west) >= 8
-    np.testing.assert_allclose(west[:, 1:], east[:, 1:], atol=CLOSE_M)
+    np.testing.assert_allclose(west[:, 1:], east[:, 1:], atol=0.03)  # each is pulled 1 cm along its own face
 
 
 def test_placement_is_deterministic_and_local(build):
