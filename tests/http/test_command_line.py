@@ -1,6 +1,8 @@
 """The command line's exit status and its one line on stderr."""
 
+import errno
 import json
+import os
 import shutil
 import signal
 import socket
@@ -14,11 +16,14 @@ from typing import Any
 import httpx
 import pytest
 
+from bake_jobs.config import PRESETS
 from gi_core.errors import InputError
 from server.cli import parse_sectors
 from server.settings import Settings, is_loopback, read_token
+from server.version import program_version
 
 RunCommand = Callable[..., Any]
+SOURCE = "procedural:midtown?blocks=1x1&seed=1"
 
 
 def expect_refusal(done: Any, *words: str) -> None:
@@ -31,7 +36,7 @@ def expect_refusal(done: Any, *words: str) -> None:
 
 
 def test_every_command_has_help(sectorlight: RunCommand) -> None:
-    for command in ([], ["bake"], ["info"], ["serve"]):
+    for command in ([], ["bake"], ["info"], ["serve"], ["compare"], ["bench"]):
         done = sectorlight(*command, "--help")
         assert done.returncode == 0
         assert "Usage" in done.stdout
@@ -44,6 +49,11 @@ def test_help_needs_neither_baker_nor_server() -> None:
         "heavy = {'fastapi', 'pyopencl', 'embreex', 'trimesh', 'scipy'} & set(sys.modules); assert not heavy, heavy"
     )
     subprocess.run([sys.executable, "-c", check], check=True, timeout=60)
+
+
+def test_version(sectorlight: RunCommand) -> None:
+    done = sectorlight("--version")
+    assert (done.returncode, done.stdout) == (0, f"sectorlight {program_version()}\n")
 
 
 def test_a_wrong_option_is_the_user_s(sectorlight: RunCommand) -> None:
@@ -98,6 +108,66 @@ def test_info_shows_the_dataset_and_a_sector(sectorlight: RunCommand, city: Path
     assert "factors" in one.stdout
     expect_refusal(sectorlight("info", str(city), "900,900"), "900,900")
     expect_refusal(sectorlight("info", str(city), "north"), "expected X,Z")
+
+
+def test_presets_that_come_later_are_refused_before_anything_is_read(sectorlight: RunCommand, tmp_path: Path) -> None:
+    for quality in ("standard", "reference", "best"):
+        done = sectorlight("bake", SOURCE, "-o", str(tmp_path / "out"), "--quality", quality)
+        expect_refusal(done, quality, *PRESETS)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_cluster_is_not_taken_yet(sectorlight: RunCommand, tmp_path: Path) -> None:
+    done = sectorlight("bake", SOURCE, "-o", str(tmp_path / "out"), "--ray", "somewhere:6379")
+    assert done.returncode == 2
+    assert "--ray" in done.stderr
+
+
+def test_a_bake_into_a_file_is_refused_and_leaves_it(sectorlight: RunCommand, tmp_path: Path) -> None:
+    (tmp_path / "notes").write_text("mine")
+    expect_refusal(sectorlight("bake", SOURCE, "-o", str(tmp_path / "notes")), "notes", "folder")
+    assert (tmp_path / "notes").read_text() == "mine"
+
+
+def test_what_the_system_refuses_is_one_line_with_the_path(sectorlight: RunCommand, tmp_path: Path) -> None:
+    (tmp_path / "notes").write_text("mine")
+    done = sectorlight("bake", SOURCE, "-o", str(tmp_path / "notes" / "below"), "--quality", "draft")
+    assert done.returncode == 1
+    assert "\n" not in done.stderr.strip()
+    assert str(tmp_path / "notes") in done.stderr
+
+
+def test_a_full_disk_names_the_output(sectorlight: RunCommand, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fill(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("bake_jobs.runner.bake", fill)
+    done = sectorlight("bake", SOURCE, "-o", str(tmp_path / "out"))
+    assert (done.returncode, done.stderr) == (1, f"sectorlight: {tmp_path / 'out'}: No space left on device\n")
+
+
+def test_an_interrupted_bake_says_what_it_kept_and_resumes(tmp_path: Path) -> None:
+    output = tmp_path / "city"
+    arguments = ["bake", "procedural:midtown?blocks=2x2&seed=1", "-o", str(output), "--quality", "draft", "--jobs", "2"]
+    command = [sys.executable, "-c", "from server.cli import main; main()", *arguments]
+    # A session of its own, so that the signal reaches all of its processes, as Ctrl-C in a terminal does.
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
+        deadline = time.monotonic() + 60
+        while not list(output.glob("sectors/*.gisec")) and time.monotonic() < deadline:
+            time.sleep(0.01)
+        os.killpg(process.pid, signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "Traceback" not in errors
+    finished = {path: path.read_bytes() for path in output.glob("sectors/*.gisec")}
+    assert f"{output} holds {len(finished)} finished sectors" in " ".join(errors.split())
+    assert not (output / "world.json").exists()
+
+    again = subprocess.run(command, check=False, capture_output=True, text=True, timeout=120)
+    assert again.returncode == 0, again.stderr
+    assert f"{len(finished)} of " in again.stderr
+    assert len(list(output.glob("sectors/*.gisec"))) == len(json.loads((output / "world.json").read_text())["sectors"]) > len(finished)
+    assert all(path.read_bytes() == content for path, content in finished.items())
 
 
 def test_ctrl_c_stops_a_server_cleanly(city: Path) -> None:

@@ -1,0 +1,35 @@
+"""A worker that is just starting must not die of the Ctrl-C that its parent handles."""
+
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from bake_jobs.runner import _interrupts_held
+
+IS_BLOCKED = "import signal; print(signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, []))"
+
+
+def started_process_says() -> str:
+    return subprocess.run([sys.executable, "-c", IS_BLOCKED], capture_output=True, text=True, timeout=60, check=True).stdout.strip()
+
+
+def test_only_processes_started_in_the_block_never_see_an_interrupt() -> None:
+    with _interrupts_held():
+        assert started_process_says() == "True"
+    assert started_process_says() == "False"
+
+
+def test_an_interrupt_in_the_block_reaches_the_parent_when_it_ends() -> None:
+    reached_the_end = False
+
+    def interrupt_within() -> None:
+        nonlocal reached_the_end
+        with _interrupts_held():
+            signal.raise_signal(signal.SIGINT)
+            reached_the_end = True
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupt_within()
+    assert reached_the_end

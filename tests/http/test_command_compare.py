@@ -1,0 +1,106 @@
+"""``sectorlight compare``: its options, its files, its refusals. What it measures is held elsewhere."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from PIL import Image
+
+from bake_jobs.cli_compare import sectors_of, split_states
+from bake_jobs.compare import STAGES
+from gi_core.dataset import Dataset
+from gi_core.errors import InputError
+
+RunCommand = Callable[..., Any]
+SMALL = ("--sectors", "1", "--points", "3", "--samples", "16")
+
+
+def test_it_prints_a_table_and_writes_json_and_a_chart(sectorlight: RunCommand, city: Path, tmp_path: Path) -> None:
+    before = {path: path.stat().st_mtime_ns for path in city.rglob("*")}
+    files = ("--json", str(tmp_path / "out.json"), "--plot", str(tmp_path / "out.png"))
+    done = sectorlight("compare", str(city), *SMALL, "--states", "noon,dusk=19:00/clear:haze=0.5,cloud_cover=0.2", *files)
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / "out.json").read_text())
+    assert (report["preset"], report["basis"]) == ("draft", "cube")
+    assert list(report["states"]) == ["noon", "dusk"]
+    for stages in report["states"].values():
+        assert tuple(stages) == STAGES == ("probes", "near", "mid", "shaded", "floor")
+        assert all({"n", "median", "p95", "bias", "nrmse"} <= set(numbers) for numbers in stages.values())
+        assert stages["probes"]["n"] == 6 * 3
+    assert len(report["sectors"]) == 1
+    for word in ("noon", "dusk", *STAGES):
+        assert word in done.stdout
+    with Image.open(tmp_path / "out.png") as picture:
+        assert picture.format == "PNG"
+    assert {path: path.stat().st_mtime_ns for path in city.rglob("*")} == before  # the dataset is only read
+
+
+def test_the_same_seed_gives_the_same_report(sectorlight: RunCommand, city: Path, tmp_path: Path) -> None:
+    reports = []
+    for number, seed in enumerate(("4", "4", "5")):
+        path = tmp_path / f"{number}.json"
+        assert sectorlight("compare", str(city), *SMALL, "--states", "noon", "--seed", seed, "--json", str(path)).returncode == 0
+        reports.append(path.read_bytes())
+    assert reports[0] == reports[1] != reports[2]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--states", "foggy_noon"), ("foggy_noon", "low_sun")),
+        (("--states", "noon,noon"), ("distinct",)),
+        (("--states", "a=25:00/clear"), ("25:00",)),
+        (("--states", "a=12:00/hail"), ("hail", "overcast")),
+        (("--sectors", "some"), ("some", "X0:X1,Z0:Z1")),
+        (("--sectors", "0"), ("found '0'",)),
+        (("--sectors", "900:901,0:1"), ("900:901,0:1", "info")),
+        (("--sectors", "1:0,0:1"), ("X0 < X1",)),
+        (("--source", "nowhere.glb"), ("nowhere.glb",)),
+        (("--device", "abacus"), ("abacus", "there are")),
+        (("--json", "nowhere/out.json"), ("nowhere/out.json", "folder that exists")),
+        (("--plot", "nowhere/out.png"), ("nowhere/out.png", "folder that exists")),
+        (("--plot", "out.jpg"), ("out.jpg", ".png")),
+    ],
+)
+def test_bad_input_is_one_clear_line(sectorlight: RunCommand, city: Path, options: tuple[str, ...], words: tuple[str, ...]) -> None:
+    done = sectorlight("compare", str(city), *options)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert "\n" not in done.stderr.strip()
+    for word in words:
+        assert word in done.stderr
+
+
+def test_no_dataset_is_one_clear_line(sectorlight: RunCommand, tmp_path: Path) -> None:
+    done = sectorlight("compare", str(tmp_path))
+    assert done.returncode == 2
+    assert str(tmp_path) in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("text", "states"),
+    [
+        ("noon", ["noon"]),
+        ("noon,low_sun", ["noon", "low_sun"]),
+        ("a=12:00/clear:haze=1,snow=0,noon", ["a=12:00/clear:haze=1,snow=0", "noon"]),
+        ("a=12:00/clear,b=13:00/fog", ["a=12:00/clear", "b=13:00/fog"]),
+        ("", [""]),
+        ("haze=1,noon", ["haze=1", "noon"]),
+    ],
+)
+def test_commas_part_states_but_not_a_weather(text: str, states: list[str]) -> None:
+    assert split_states(text) == states
+
+
+def test_sectors_are_all_some_or_those_in_a_range(city: Path) -> None:
+    known = sorted(Dataset.open(city).world.sectors)
+    assert len(known) > 1
+    assert sectors_of(city, "all", 0) == known
+    assert len(sectors_of(city, "1", 0)) == 1
+    assert sectors_of(city, "999999", 0) == known  # all of this city's sectors have probes
+    first = known[0]
+    assert sectors_of(city, ((first.x, first.x + 1), (first.z, first.z + 1)), 0) == [first]
+    with pytest.raises(InputError, match="--sectors"):
+        sectors_of(city, "-1", 0)
