@@ -105,10 +105,12 @@ class Engine:
         mask = np.full(VOLUME_SHAPE, VOXEL_NO_SECTOR, np.uint8)
         with self._lock:
             target = self._device.allocate(values.nbytes)
-            for box in boxes:
-                self._fill(box, lighting, target, mask)
+            unlit = [box for box in boxes if not self._fill(box, lighting, target, mask)]
             self._device.read(target, values)
-        fill_missing_columns(values, mask)
+        lit_mask = mask.copy()
+        for box in unlit:  # it has air, but no probe: lit like columns without a sector, by the nearest that are
+            lit_mask[_slices(box)] = VOXEL_NO_SECTOR
+        fill_missing_columns(values, lit_mask)
         report = self.dataset.world.error_report
         expected = None if report is None else report.get("expected_error")
         return Volume(values, mask, first, tuple(box.index for box in boxes), self.dataset.world.basis, expected)
@@ -143,7 +145,8 @@ class Engine:
         position_, cubes_, room, flags = (np.concatenate([part[i] for part in found]) for i in range(4))
         return LitProbes(position_, cubes_, room, flags, tuple(s for part in found for s in part[4]))
 
-    def _fill(self, box: SectorBox, lighting: Lighting, target: cl.Buffer, mask: UInt8) -> None:
+    def _fill(self, box: SectorBox, lighting: Lighting, target: cl.Buffer, mask: UInt8) -> bool:
+        """Fill a sector's part of a volume and its mask; whether the sector has a probe, and so any light."""
         cubes = self.lit_sector(box.index, lighting)
         resident = self._resident(box.index)
         sector = resident.sector
@@ -153,8 +156,8 @@ class Engine:
             record = self._device.upload(box_record(box, sector))
             kernel.set_args(record, resident.voxel_probe, resident.voxel_weight, resident.cubes, target)
             cl.enqueue_nd_range_kernel(self._device.queue, kernel, tuple(int(n) for n in box.size), None)
-        (x, y, z), (nx, ny, nz) = box.volume_first, box.size
-        mask[y : y + ny, z : z + nz, x : x + nx] = box_mask(box, sector)
+        mask[_slices(box)] = box_mask(box, sector)
+        return sector.probe_count > 0
 
     def _resident(self, index: SectorIndex) -> ResidentSector:
         found = self._residents.get(index)
@@ -182,3 +185,9 @@ class Engine:
         low, high = (", ".join(f"{v:.1f}" for v in corner) for corner in self.dataset.world.bounds)
         here = ", ".join(f"{v:g}" for v in position)
         return f"position ({here}) is outside this world; expected x, y, z [m] within ({low}) and ({high})"
+
+
+def _slices(box: SectorBox) -> tuple[slice, slice, slice]:
+    """Where a box lies in its volume's (y, z, x)."""
+    (x, y, z), (nx, ny, nz) = box.volume_first.tolist(), box.size.tolist()
+    return slice(y, y + ny), slice(z, z + nz), slice(x, x + nx)

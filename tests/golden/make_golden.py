@@ -58,9 +58,9 @@ def tiny_scene() -> Scene:
     )
 
 
-def write_golden(folder: Path, settings: BakeSettings = SETTINGS) -> WorldInfo:
-    """The whole dataset into a folder."""
-    scene = tiny_scene()
+def write_golden(folder: Path, settings: BakeSettings = SETTINGS, scene: Scene | None = None) -> WorldInfo:
+    """A whole dataset into a folder; of the tiny scene when no other is given."""
+    scene = scene or tiny_scene()
     table = SunTable.build(scene.location, settings.sun_declination_step_degrees, settings.sun_hour_step_degrees)
     baker = SectorBaker(scene, settings, table.directions, BAKE_ID)
     sectors: dict[SectorIndex, SectorFacts] = {}

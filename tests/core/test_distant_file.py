@@ -1,0 +1,75 @@
+"""The far view's texels: one per sector, in their place, and refused where they can't be."""
+
+import numpy as np
+import pytest
+
+from gi_core import container, distant_file
+from gi_core.distant_file import KIND, VERSION
+from gi_core.errors import CorruptFileError
+from gi_core.grid import SectorIndex
+
+BAKE_ID = "b" * 32
+TEXELS = {
+    SectorIndex(-2, 5): [0.1, 0.2, 0.3, 0.0, 0.5, 0.6],
+    SectorIndex(1, 4): [0.6, 0.5, 1.0, 0.0, 0.2, 0.1],
+    SectorIndex(-1, 6): [0.0] * 6,
+}
+
+
+def test_each_sector_is_at_its_texel_and_the_others_are_dark():
+    found, bake_id = distant_file.decode(distant_file.encode(distant_file.assemble(TEXELS), BAKE_ID), "here")
+    assert bake_id == BAKE_ID
+    assert found.origin == (-2, 4)
+    assert found.sky.shape == (3, 4, 6)
+    for row in range(3):
+        for column in range(4):
+            index = SectorIndex(-2 + column, 4 + row)
+            assert found.valid[row, column] == (index in TEXELS)
+            np.testing.assert_array_equal(found.sky[row, column], np.array(TEXELS.get(index, [0.0] * 6), np.float32))
+
+
+def test_no_sector_gives_no_texel():
+    found, _ = distant_file.decode(distant_file.encode(distant_file.assemble({}), BAKE_ID), "here")
+    assert found.sky.shape == (0, 0, 6)
+
+
+def test_the_order_of_baking_does_not_matter():
+    backwards = dict(reversed(TEXELS.items()))
+    first, second = (distant_file.encode(distant_file.assemble(texels), BAKE_ID) for texels in (TEXELS, backwards))
+    assert first == second
+
+
+@pytest.mark.parametrize(
+    ("meta", "arrays"),
+    [
+        ({}, {"sky": np.zeros((2, 2, 5), np.float32)}),
+        ({}, {"sky": np.zeros((2, 3, 6), np.float32)}),
+        ({}, {"sky": np.full((2, 2, 6), np.nan, np.float32)}),
+        ({}, {"sky": np.full((2, 2, 6), np.inf, np.float32)}),
+        ({}, {"sky": np.full((2, 2, 6), -0.1, np.float32)}),
+        ({}, {"sky": np.full((2, 2, 6), 1.1, np.float32)}),
+        ({}, {"valid": np.full((2, 2), 2, np.uint8)}),
+        ({}, {"valid": np.zeros((2, 2), np.uint16)}),
+        ({}, {"extra": np.zeros(1, np.uint8)}),
+        ({"origin": 3}, {}),
+        ({"origin": [1]}, {}),
+        ({"origin": ["west", 2]}, {}),
+        ({"origin": [float("inf"), 2]}, {}),
+        ({"extra": 1}, {}),
+    ],
+)
+def test_contents_that_do_not_fit_are_refused_by_name(meta, arrays):
+    whole = {"sky": np.zeros((2, 2, 6), np.float32), "valid": np.ones((2, 2), np.uint8)} | arrays
+    data = container.encode(KIND, VERSION, {"origin": [0, 0], "bake_id": BAKE_ID} | meta, whole)
+    with pytest.raises(CorruptFileError, match=r"^bad\.gidist: .*; bake it again$"):
+        distant_file.decode(data, "bad.gidist")
+
+
+@pytest.mark.parametrize("missing", ["sky", "valid", "origin", "bake_id"])
+def test_contents_that_are_missing_are_refused_by_name(missing):
+    arrays = {"sky": np.zeros((2, 2, 6), np.float32), "valid": np.ones((2, 2), np.uint8)}
+    meta = {"origin": [0, 0], "bake_id": BAKE_ID}
+    arrays.pop(missing, None)
+    meta.pop(missing, None)
+    with pytest.raises(CorruptFileError, match=rf"^bad\.gidist: .*{missing.replace('_', '.')}"):
+        distant_file.decode(container.encode(KIND, VERSION, meta, arrays), "bad.gidist")
