@@ -85,7 +85,7 @@ class Connection:
         raise BenchError(f"http_volume: expected a reply of at most {len(self._buffer)} bytes with a Content-Length")
 
 
-def bench_http(dataset_path: Path, device: str | None = None, rounds: int = 25, requests_per_round: int = 200) -> Measurement:
+def bench_http(dataset_path: Path, device: str | None = None, rounds: int = 60, requests_per_round: int = 100) -> Measurement:
     """Requests per second for one cached raw volume, the median over rounds. Higher is better; ``ratio`` = median / baseline.
 
     Raises what Dataset.open raises, and BenchError.
@@ -107,8 +107,8 @@ def bench_http(dataset_path: Path, device: str | None = None, rounds: int = 25, 
             stack.callback(connection.close)
         rates = np.zeros((rounds, 2))
         for number in range(-1, rounds):  # round -1 warms up and is overwritten by the last
-            for which, group in enumerate(connections):
-                rates[number, which] = requests_per_second(group, requests_per_round)
+            for which in (0, 1) if number % 2 else (1, 0):
+                rates[number, which] = requests_per_second(connections[which], requests_per_round)
     median, baseline = (float(v) for v in np.median(rates, axis=0))
     sizes = {"bytes": len(content), "connections": CONNECTIONS, "requests": rounds * requests_per_round}
     return Measurement(
