@@ -48,6 +48,24 @@ class WorkerLostError(SectorlightError, RuntimeError):
     code = "worker_lost"
 
 
+class DatasetWriteError(SectorlightError, OSError):
+    """The dataset's folder cannot be written: no permission, no space left, or a file in its place."""
+
+    code = "dataset_write"
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """Tell what could not be written and what to do, instead of a traceback."""
+    try:
+        yield
+    except OSError as error:
+        raise DatasetWriteError(
+            f"{error.filename or path}: {error.strerror or error}; finished sectors are kept: "
+            "make room or choose another --output, and start the same bake again"
+        ) from error
+
+
 @dataclass(frozen=True)
 class _Finished:
     index: SectorIndex
@@ -71,17 +89,21 @@ def bake(
     jobs : worker processes; None takes every core. sectors : half-open ranges ((x0, x1), (z0, z1)); None takes all.
     restart : bake everything anew instead of skipping finished sectors. seed : recorded with the dataset.
 
-    Raises InputError (SourceError among them) for input that cannot be baked, WorkerLostError when a worker dies. An interrupt
-    leaves finished sectors in place, and the same call resumes.
+    Raises InputError (SourceError among them) for input that cannot be baked, WorkerLostError when a worker dies, DatasetWriteError
+    when the folder cannot be written. An interrupt leaves finished sectors in place, and the same call resumes.
     """
     console = console or Console(stderr=True)
     settings = settings_for(quality)
+    if output.exists() and not output.is_dir():
+        raise InputError(f"--output {output}: expected a folder, found a file")
     scene = load_scene(source)
     table = SunTable.build(scene.location, settings.sun_declination_step_degrees, settings.sun_hour_step_degrees)
     bake_id = _bake_id(scene, settings, seed)
     wanted = _chosen(SectorCutter(scene).sectors(), sectors)
-    if restart:
-        _clear(output)
+    with _writing(output):
+        output.mkdir(parents=True, exist_ok=True)
+        if restart:
+            _clear(output)
     done = {i: f for i in wanted if (f := _finished(output, i, bake_id)) is not None}
     remaining = [i for i in wanted if i not in done]
     if done:
@@ -90,7 +112,8 @@ def bake(
     started = time.perf_counter()
     if remaining:
         # A world.json names a complete bake; while this one runs there is none.
-        (output / WORLD_FILE).unlink(missing_ok=True)
+        with _writing(output):
+            (output / WORLD_FILE).unlink(missing_ok=True)
         with Progress(
             TextColumn("baking {task.fields[preset]}"),
             BarColumn(),
@@ -106,7 +129,6 @@ def bake(
                 progress.advance(task)
     wall_seconds = time.perf_counter() - started
     texels = distant_file.assemble({i: f.distant_sky for i, f in done.items()})
-    write_atomic(output / DISTANT_FILE, distant_file.encode(texels, bake_id))
     world = WorldInfo(
         name=scene.name,
         source=Path(source).name if Path(source).exists() else source,
@@ -124,7 +146,9 @@ def bake(
         lamps=scene.lamps,
         dropped_triangles=asdict(scene.dropped),
     )
-    write_world(output, world)
+    with _writing(output):
+        write_atomic(output / DISTANT_FILE, distant_file.encode(texels, bake_id))
+        write_world(output, world)
     print_summary(console, world, sum(f.seconds for f in done.values()), wall_seconds, len(remaining), workers)
     return world
 
@@ -174,14 +198,14 @@ def _finished(output: Path, index: SectorIndex, bake_id: str) -> _Finished | Non
     path, geometry = sector_path(output, index), geometry_path(output, index)
     if not path.is_file() or not geometry.is_file():
         return None
-    data = path.read_bytes()
     try:
+        data = path.read_bytes()
         sector, meta = sector_file.decode(data, str(path))
         _, cut, cut_id = geometry_file.read(geometry)
         if {sector.index, cut} != {index} or {meta["bake_id"], cut_id} != {bake_id}:
             return None
         return _Finished(index, _facts(data, geometry.stat().st_size, meta), meta["distant_sky"], 0.0)
-    except (FormatError, KeyError, TypeError, ValueError):
+    except (OSError, FormatError, KeyError, TypeError, ValueError):
         return None  # damaged: bake it again
 
 
@@ -217,9 +241,10 @@ def _bake_one(index: SectorIndex) -> _Finished:
     assert _baker is not None
     started = time.process_time()
     baked = _baker.bake(index)
-    write_atomic(geometry_path(_output, index), baked.geometry_bytes)
-    # The sector file comes last: where it is, both are.
-    write_atomic(sector_path(_output, index), baked.sector_bytes)
+    with _writing(_output):
+        write_atomic(geometry_path(_output, index), baked.geometry_bytes)
+        # The sector file comes last: where it is, both are.
+        write_atomic(sector_path(_output, index), baked.sector_bytes)
     facts = _facts(baked.sector_bytes, len(baked.geometry_bytes), baked.meta)
     return _Finished(index, facts, baked.meta["distant_sky"], time.process_time() - started)
 
@@ -232,7 +257,8 @@ def _run(
     empty = Scene(**{**scene.__dict__, **{n: getattr(scene, n)[:0] for n in names}})
     with tempfile.TemporaryDirectory(prefix="sectorlight-") as folder:
         arrays_path = Path(folder) / "scene.npz"
-        np.savez(arrays_path, **{n: getattr(scene, n) for n in names})
+        with _writing(arrays_path):
+            np.savez(arrays_path, **{n: getattr(scene, n) for n in names})
         pool = ProcessPoolExecutor(
             workers,
             # A forked child would inherit the parent's threads' locks.
