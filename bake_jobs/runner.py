@@ -35,6 +35,7 @@ from gi_core.container import write_atomic
 from gi_core.dataset import DISTANT_FILE, WORLD_FILE, SectorFacts, WorldInfo, geometry_path, sector_path, write_world
 from gi_core.errors import FormatError, InputError, SectorlightError
 from gi_core.grid import SectorIndex
+from gi_core.json_fields import LARGEST_INTEGER
 from gi_core.sun_table import SunTable
 
 # Part of the bake id: raised whenever the same settings would give other bytes than before.
@@ -94,6 +95,8 @@ def bake(
     """
     console = console or Console(stderr=True)
     settings = settings_for(quality)
+    if not 0 <= seed <= LARGEST_INTEGER:
+        raise InputError(f"seed: expected a whole number of 0..{LARGEST_INTEGER}, found {seed}")
     if output.exists() and not output.is_dir():
         raise InputError(f"--output {output}: expected a folder, found a file")
     scene = load_scene(source)

@@ -6,13 +6,19 @@ Lengths are integers of 1/512 m (2 mm), so that a vertex on a border is the same
 import numpy as np
 
 from gi_core.arrays import AnyArray, Float32, Float64, Int32, UInt8, UInt16
+from gi_core.errors import InputError
 
 STEPS_PER_METRE = 512
 
 
 def encode_length(metres: AnyArray) -> Int32:
-    """[m] -> int32 steps of 1/512 m, nearest."""
-    return np.rint(np.asarray(metres, np.float64) * STEPS_PER_METRE).astype(np.int32)
+    """[m] -> int32 steps of 1/512 m, nearest. Raises InputError beyond +-4194 km, where steps no longer fit."""
+    steps = np.rint(np.asarray(metres, np.float64) * STEPS_PER_METRE)
+    if not (np.abs(steps) <= np.iinfo(np.int32).max).all():
+        raise InputError(
+            "a height or place lies 4000 km or more from the origin; expected metres, near the origin: move or scale the source"
+        )
+    return steps.astype(np.int32)
 
 
 def decode_length(steps: AnyArray) -> Float64:

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from bake_jobs.runner import bake
 from gi_core.dataset import MAX_WORLD_BYTES, Dataset, WorldInfo, write_world
 from gi_core.errors import CorruptFileError, FormatError, FormatVersionError, InputError, SectorlightError
 from gi_core.grid import SectorIndex
@@ -256,6 +257,13 @@ def test_no_damage_to_the_text_gives_a_traceback(place, octets):
         return  # Dataset.open turns these into CorruptFileError: tested above
     with contextlib.suppress(SectorlightError):
         WorldInfo.from_json(record, "here")
+
+
+@pytest.mark.parametrize("seed", [-1, 1 << 53])
+def test_a_seed_that_no_reader_would_accept_is_refused_before_baking(tmp_path, seed):
+    with pytest.raises(InputError, match=f"seed: expected .* found {seed}"):
+        bake("procedural:midtown?blocks=1x1", tmp_path / "city", "draft", 1, None, seed)
+    assert not (tmp_path / "city").exists()
 
 
 def test_an_unreadable_file_is_the_users_to_mend(tmp_path, monkeypatch):

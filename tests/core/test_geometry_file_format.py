@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gi_core import container, geometry_file
-from gi_core.errors import CorruptFileError, FormatVersionError
+from gi_core.errors import CorruptFileError, FormatVersionError, InputError
 from gi_core.geometry_file import KIND, VERSION, Geometry
 from gi_core.grid import SectorIndex
 
@@ -61,6 +61,14 @@ def test_triangles_that_rounding_flattens_are_left_out_and_the_others_keep_their
     np.testing.assert_array_equal(corners(found)[0], vertices[3:])
     assert len(found.triangles) == 1
     assert (np.abs(found.albedo[0] - albedo[1]) < 0.004).all()  # a step of the square root
+
+
+@pytest.mark.parametrize("height", [4.2e6, -4.2e6, np.inf, np.nan])
+def test_what_the_steps_cannot_hold_is_refused_and_does_not_wrap(height):
+    vertices = np.array([[0.0, height, 0], [1, height, 0], [0, height, 1]])
+    colour = np.full((1, 3), 0.5, np.float32)
+    with pytest.raises(InputError, match="4000 km"):
+        geometry_file.encode(SectorIndex(0, 0), Geometry(vertices, np.array([[0, 1, 2]], np.int32), colour, 0 * colour), BAKE_ID)
 
 
 def test_winding_is_kept():

@@ -152,7 +152,10 @@ def test_a_dataset_made_today_is_described_by_format_md(tmp_path):
         sector = opened.sector(index)
         np.testing.assert_array_equal(arrays["voxel_probe"], sector.voxel_probe)
         np.testing.assert_array_equal(arrays["factor_source"], sector.factor_source)
-        reader.read_geometry(dataset.geometry_path(tmp_path, index).read_bytes())
+        cut = dataset.geometry_path(tmp_path, index)
+        reader.read_geometry(cut.read_bytes())
+        assert stored_arrays(cut) == stored_arrays(GOLDEN / "geometry" / cut.name)
+    assert stored_arrays(tmp_path / "distant.gidist") == stored_arrays(GOLDEN / "distant.gidist")
 
 
 def test_the_hexdump_in_format_md_is_the_golden_sector():
