@@ -101,6 +101,7 @@ def bench_http(dataset_path: Path, device: str | None = None, rounds: int = 60, 
         bare_port = stack.enter_context(server_process((*BARE, str(folder / "volume")), {}))
         if fetch(bare_port, target) != content or fetch(real_port, target) != content:
             raise BenchError("http_volume: the two servers' replies differ, so their speeds cannot be compared")
+        stack.enter_context(own_core())
         ports = (real_port, bare_port)
         connections = [[Connection(port, target, len(content)) for _ in range(CONNECTIONS)] for port in ports]
         for connection in (c for group in connections for c in group):
@@ -140,9 +141,29 @@ def server_process(arguments: tuple[str, ...], environment: dict[str, str]) -> I
             port = urlsplit(line.split()[-1]).port
             assert port is not None
             wait_until_listening(process, port)
+            if len(cores()) > 1:
+                os.sched_setaffinity(process.pid, {cores()[-1]})
             yield port
         finally:
             process.terminate()
+
+
+def cores() -> list[int]:
+    """Cores that this process may use, in order; none where the system does not say."""
+    return sorted(os.sched_getaffinity(0)) if sys.platform == "linux" else []
+
+
+@contextmanager
+def own_core() -> Iterator[None]:
+    """This process on the first core while the servers have the last: left to the scheduler, the ratio swings by a third between runs."""
+    before = cores()
+    if len(before) > 1:
+        os.sched_setaffinity(0, before[:1])
+    try:
+        yield
+    finally:
+        if len(before) > 1:
+            os.sched_setaffinity(0, before)
 
 
 def wait_until_listening(process: "subprocess.Popen[str]", port: int) -> None:
