@@ -105,7 +105,7 @@ def _grown(vertices: Float64, triangles: Int32) -> tuple[Float64, Int32]:
     corner = corner.reshape(-1)
     weighted = (normal[:, None] * angle[:, :, None]).reshape(-1, 3)
     outward = np.stack([np.bincount(corner, weighted[:, axis], len(used)) for axis in range(3)], axis=1)
-    edge = edge / np.maximum(np.linalg.norm(edge, axis=2, keepdims=True), 1e-30)
+    outward = outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-30)
     # A face moves by less than its corners, which go out at an angle to it: the sharper the corner, the further it has to go.
     straight = np.full(len(used), 1.0)
     np.minimum.at(straight, corner, np.einsum("ij,ij->i", outward[corner], np.repeat(normal, 3, axis=0)))

@@ -133,6 +133,22 @@ def test_no_probe_stands_inside_a_solid(build, name):
     assert not inside(scene, [[25, 12.5, 25]])[0]
 
 
+@pytest.mark.parametrize("count", [1, 12])
+def test_solids_end_within_four_centimetres_of_their_walls(build, count):
+    """They grow for the test by up to 36 mm, each by another amount."""
+    row = build().ground()
+    for n in range(count):
+        row.box((4.0 * n, 0, 10), (4.0 * n + 2, 5, 12))
+    scene = row.scene()
+    middle = np.array([1.0, 2.5, 11.0]) + np.arange(count)[:, None] * [4.0, 0, 0]
+    half = np.array([1.0, 2.5, 1.0])
+    for axis, sign in ((0, -1), (0, 1), (1, 1), (2, -1), (2, 1)):
+        for beyond, expected in ((-0.01, True), (0.04, False)):
+            points = middle + np.array([0.13, 0.21, -0.17])
+            points[:, axis] = middle[:, axis] + sign * (half[axis] + beyond)
+            assert (inside(scene, points) == expected).all()
+
+
 def test_a_point_between_towers_is_not_inside(build):
     towers = build().ground(low=(-200, -200), high=(264, 264))
     for x in range(0, 64, 16):
