@@ -9,7 +9,6 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-import pyopencl as cl
 
 from gi_core import relight_twin, sector_file
 from gi_core.constants import VOLUME_SHAPE
@@ -147,19 +146,17 @@ def bench_volume(device: Device, rounds: int = 100) -> Measurement:
     resident.write_cubes(np.random.default_rng(0).uniform(0, 1e4, (TALK_PROBES, 6, 3)).astype(np.float32))
     values = np.zeros((6, *VOLUME_SHAPE, 3), np.float32)
     target = device.allocate(values.nbytes)
-    kernel = device.kernel("fill_volume", BASIS_SIZE=6, VOXEL_PROBES=resident.sector.voxel_probe.shape[3])
     # The one made-up sector stands in for each of the four around the corner that they share.
     boxes = plan_boxes(np.array([4, 0, 4]))
     records = []
     for box in boxes:
         record = box_record(box, resident.sector)
         record["sector_first"][0, [0, 2]] = 0
-        records.append((device.upload(record), (min(int(box.size[0]), 20), int(box.size[1]), min(int(box.size[2]), 20))))
+        records.append((record, (min(int(box.size[0]), 20), int(box.size[1]), min(int(box.size[2]), 20))))
 
     def fill() -> None:
         for record, size in records:
-            kernel.set_args(record, resident.voxel_probe, resident.voxel_weight, resident.cubes, target)
-            cl.enqueue_nd_range_kernel(device.queue, kernel, size, None)
+            resident.fill_volume(record, size, target)
         device.queue.finish()
 
     copy = values.copy()

@@ -152,10 +152,7 @@ class Engine:
         sector = resident.sector
         resident.write_cubes(cubes)
         if sector.probe_count:
-            kernel = self._device.kernel("fill_volume", BASIS_SIZE=sector.basis_size, VOXEL_PROBES=sector.voxel_probe.shape[3])
-            record = self._device.upload(box_record(box, sector))
-            kernel.set_args(record, resident.voxel_probe, resident.voxel_weight, resident.cubes, target)
-            cl.enqueue_nd_range_kernel(self._device.queue, kernel, tuple(int(n) for n in box.size), None)
+            resident.fill_volume(box_record(box, sector), tuple(int(n) for n in box.size), target)
         mask[_slices(box)] = box_mask(box, sector)
         return sector.probe_count > 0
 

@@ -1,14 +1,15 @@
 """The relighter: a sector's arrays on the device, and the two passes that light them (slides "Relighting", "Multiple bounces")."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pyopencl as cl
 
-from gi_core.arrays import Float32
+from gi_core.arrays import AnyArray, Float32
 from gi_core.constants import ALBEDO_MAX
 from gi_core.device import Device
-from gi_core.layout import SURFEL
+from gi_core.layout import DIRECTIONAL_LIGHT, MAX_DIRECTIONAL_LIGHTS, SURFEL, VOLUME_BOX
 from gi_core.relight_input import RelightInput
 from gi_core.sector import Sector
 
@@ -34,6 +35,14 @@ class Converged:
     passes: int
 
 
+class Launch:
+    """A kernel with its arguments bound, and how many work-items it needs, rounded up to whole work-groups."""
+
+    def __init__(self, kernel: cl.Kernel, items: int) -> None:
+        self.kernel = kernel
+        self.global_size = -(-items // GROUP) * GROUP
+
+
 class ResidentSector:
     """One sector's buffers on a device. Only what the sector has: no emission, no buffer."""
 
@@ -55,11 +64,44 @@ class ResidentSector:
         self.voxel_weight = device.upload(sector.voxel_weight)
         self.cubes = device.allocate(sector.probe_count * sector.basis_size * 12)
         self.exitance = device.allocate((sector.brick_count + sky_patches) * 16)
+        self.lights = device.allocate(MAX_DIRECTIONAL_LIGHTS * DIRECTIONAL_LIGHT.dtype.itemsize)
+        self.box = device.allocate(VOLUME_BOX.dtype.itemsize)
+        self._fill: cl.Kernel | None = None
+        self._given: RelightInput | None = None
+        self._launches: dict[int, list[Launch]] = {}
 
     @property
     def nbytes(self) -> int:
         """Bytes on the device."""
         return sum(value.size for value in vars(self).values() if isinstance(value, cl.Buffer))
+
+    def launches(self, given: RelightInput) -> list["Launch"]:
+        """One pass over this sector under ``given``, whose light is on the device when this returns; empty without probes.
+
+        Arguments are bound once for each number of lights: making a kernel takes longer than running it.
+        """
+        if self.sector.probe_count == 0:
+            return []
+        if given is not self._given:
+            patches = np.zeros((len(given.patch_exitance), 4), np.float32)
+            patches[:, :3] = given.patch_exitance
+            cl.enqueue_copy(self.device.queue, self.exitance, patches, dst_offset=self.sector.brick_count * 16)
+            if len(given.lights):
+                cl.enqueue_copy(self.device.queue, self.lights, np.ascontiguousarray(given.lights))
+            self._given = given
+        count = len(given.lights)
+        if count not in self._launches:
+            self._launches[count] = [*([self._bind_bricks(count)] if self.sector.brick_count else []), self._bind_probes()]
+        return self._launches[count]
+
+    def fill_volume(self, box: AnyArray, size: tuple[int, ...], target: cl.Buffer) -> None:
+        """Enqueue this sector's part of a volume: ``box`` (1,) layout.VOLUME_BOX, its size (x, y, z), the volume's buffer."""
+        if self._fill is None:
+            sector = self.sector
+            self._fill = self.device.kernel("fill_volume", BASIS_SIZE=sector.basis_size, VOXEL_PROBES=sector.voxel_probe.shape[3])
+        cl.enqueue_copy(self.device.queue, self.box, box)
+        self._fill.set_args(self.box, self.voxel_probe, self.voxel_weight, self.cubes, target)
+        cl.enqueue_nd_range_kernel(self.device.queue, self._fill, size, None)
 
     def read_cubes(self) -> Float32:
         """The probes' cubes (P, B, 3) float32 [lx], after all that was enqueued."""
@@ -72,6 +114,42 @@ class ResidentSector:
         if cubes.size:
             cl.enqueue_copy(self.device.queue, self.cubes, np.ascontiguousarray(cubes, np.float32))
 
+    def _bind_bricks(self, light_count: int) -> "Launch":
+        sector = self.sector
+        kernel = self.device.kernel(
+            "relight_bricks",
+            DIRECTIONAL_LIGHTS=light_count,
+            FEEDBACK_PROBES=sector.feedback_probe.shape[1],
+            HAS_EMISSION=int(self.emission is not None),
+        )
+        arguments: list[Any] = [
+            np.uint32(sector.brick_count),
+            self.brick_starts,
+            self.surfels,
+            self.feedback_probe,
+            self.feedback_weight,
+            self.cubes,
+        ]
+        if self.emission is not None:
+            arguments.append(self.emission)
+        if light_count:
+            arguments += [self.sun_visibility, np.uint32(sector.sun_visibility.shape[1]), self.lights]
+        kernel.set_args(*arguments, self.exitance)
+        return Launch(kernel, sector.brick_count)
+
+    def _bind_probes(self) -> "Launch":
+        sector = self.sector
+        kernel = self.device.kernel("gather_probes", BASIS_SIZE=sector.basis_size)
+        kernel.set_args(
+            np.uint32(sector.probe_count),
+            self.factor_starts,
+            self.factor_source,
+            self.factor_weight,
+            self.exitance,
+            self.cubes,
+        )
+        return Launch(kernel, sector.probe_count)
+
 
 class Relighter:
     """Lights resident sectors on one device."""
@@ -81,22 +159,10 @@ class Relighter:
 
     def relight(self, residents: list[ResidentSector], given: RelightInput, passes: int = 1) -> None:
         """Enqueue passes over sectors; each pass adds one bounce to the cubes that a sector holds. Returns before the device is done."""
-        # A query runs some hundred passes over one sector: arguments are bound once, launches repeat.
-        lights = self.device.upload(given.lights) if len(given.lights) else None
-        patches = np.zeros((len(given.patch_exitance), 4), np.float32)
-        patches[:, :3] = given.patch_exitance
-        launches = []
-        for resident in residents:
-            sector = resident.sector
-            if sector.probe_count == 0:
-                continue
-            cl.enqueue_copy(self.device.queue, resident.exitance, patches, dst_offset=sector.brick_count * 16, is_blocking=False)
-            if sector.brick_count:
-                launches.append(self._bricks(resident, lights, len(given.lights)))
-            launches.append(self._probes(resident))
+        launches = [launch for resident in residents for launch in resident.launches(given)]
         for _ in range(passes):
-            for kernel, items in launches:
-                cl.enqueue_nd_range_kernel(self.device.queue, kernel, (_whole_groups(items),), (GROUP,))
+            for launch in launches:
+                cl.enqueue_nd_range_kernel(self.device.queue, launch.kernel, (launch.global_size,), (GROUP,))
         self.device.queue.flush()
 
     def converge(self, resident: ResidentSector, given: RelightInput, residual: float = QUERY_RESIDUAL) -> Converged:
@@ -124,43 +190,3 @@ class Relighter:
             if left <= residual:
                 break
         return Converged(after, left, passes)
-
-    def _bricks(self, resident: ResidentSector, lights: cl.Buffer | None, light_count: int) -> tuple[cl.Kernel, int]:
-        sector = resident.sector
-        kernel = self.device.kernel(
-            "relight_bricks",
-            DIRECTIONAL_LIGHTS=light_count,
-            FEEDBACK_PROBES=sector.feedback_probe.shape[1],
-            HAS_EMISSION=int(resident.emission is not None),
-        )
-        arguments = [
-            np.uint32(sector.brick_count),
-            resident.brick_starts,
-            resident.surfels,
-            resident.feedback_probe,
-            resident.feedback_weight,
-            resident.cubes,
-        ]
-        if resident.emission is not None:
-            arguments.append(resident.emission)
-        if lights is not None:
-            arguments += [resident.sun_visibility, np.uint32(sector.sun_visibility.shape[1]), lights]
-        kernel.set_args(*arguments, resident.exitance)
-        return kernel, sector.brick_count
-
-    def _probes(self, resident: ResidentSector) -> tuple[cl.Kernel, int]:
-        sector = resident.sector
-        kernel = self.device.kernel("gather_probes", BASIS_SIZE=sector.basis_size)
-        kernel.set_args(
-            np.uint32(sector.probe_count),
-            resident.factor_starts,
-            resident.factor_source,
-            resident.factor_weight,
-            resident.exitance,
-            resident.cubes,
-        )
-        return kernel, sector.probe_count
-
-
-def _whole_groups(items: int) -> int:
-    return -(-items // GROUP) * GROUP

@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import pyopencl as cl
 import pytest
 
 from gi_core import layout, pocl_cpu, relight_twin
@@ -118,10 +117,7 @@ def test_a_volume_equals_the_twins_blend(device, make_sector):
     resident.write_cubes(cubes)
     box = next(b for b in plan_boxes(np.array([0, -1, 0])) if b.index == sector.index)
     target = device.allocate(6 * 16 * 32 * 32 * 3 * 4)
-    kernel = device.kernel("fill_volume", BASIS_SIZE=6, VOXEL_PROBES=4)
-    record = device.upload(box_record(box, sector))  # a kernel does not keep its arguments alive
-    kernel.set_args(record, resident.voxel_probe, resident.voxel_weight, resident.cubes, target)
-    cl.enqueue_nd_range_kernel(device.queue, kernel, tuple(int(n) for n in box.size), None)
+    resident.fill_volume(box_record(box, sector), tuple(int(n) for n in box.size), target)
     values = np.zeros((6, 16, 32, 32, 3), np.float32)
     device.read(target, values)
     expected = relight_twin.blend_voxels(sector, cubes)
