@@ -39,7 +39,7 @@ from gi_core.json_fields import LARGEST_INTEGER
 from gi_core.sun_table import SunTable
 
 # Part of the bake id: raised whenever the same settings would give other bytes than before.
-BAKER_VERSION = 3
+BAKER_VERSION = 4
 SectorRange = tuple[tuple[int, int], tuple[int, int]]
 
 

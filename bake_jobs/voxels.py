@@ -1,7 +1,8 @@
 """Which probes a voxel of the irradiance volume blends: baked interpolation, so that no leak test is left for run time.
 
-A voxel in free air blends the closest probes that it sees; one that sees none (a floor, or light would end at a pillar) takes the
-closest of its room. A voxel in a solid blends what the nearest air blends, so that trilinear sampling at a wall never turns dark.
+A voxel in free air blends the closest probes that it sees. One that sees none of them, and one in a solid, blends what the nearest air
+does that sees some: light does not end at a pillar, and trilinear sampling at a wall never turns dark. Indoors such a voxel takes the
+closest probe of its room instead, since the nearest air may be another's.
 """
 
 from dataclasses import dataclass
@@ -56,7 +57,7 @@ def bake_voxels(
     # An authored room is air, whatever way its walls were modelled.
     kind[(room == ROOM_OUTDOORS) & _solid(ray_scene, solids, centre.reshape(*shape, 3)).reshape(-1)] = VOXEL_SOLID
     probe, weight, blind = _blend(ray_scene, centre, kind, room, placement, settings)
-    source = _nearest_air(kind.reshape(shape))
+    source = _nearest((kind != VOXEL_SOLID) & ~(blind & (room == ROOM_OUTDOORS)), shape)
     probe, weight = probe[source], weight[source]
 
     # The fill margin was only there to be read from.
@@ -68,7 +69,7 @@ def bake_voxels(
         room=np.ascontiguousarray(room.reshape(shape)[inner]),
         probe=np.ascontiguousarray(probe.reshape(*shape, k)[inner]),
         weight=np.ascontiguousarray(weight.reshape(*shape, k)[inner]),
-        blind=blind,
+        blind=int(blind.sum()),
     )
 
 
@@ -101,12 +102,12 @@ def _solid(ray_scene: RayScene, solids: Solids, centre: Float64) -> Bool:
 
 def _blend(
     ray_scene: RayScene, centre: Float64, kind: UInt8, room: UInt16, placement: Placement, settings: BakeSettings
-) -> tuple[UInt16, Float32, int]:
-    """Probes (V, K) and weights (V, K) of all voxels; zero where a voxel is solid."""
+) -> tuple[UInt16, Float32, Bool]:
+    """Probes (V, K) and weights (V, K) of all voxels, zero where a voxel is solid; which voxels (V,) see none and take the closest."""
     k = settings.voxel_probes
     probe = np.zeros((len(centre), k), np.uint16)
     weight = np.zeros((len(centre), k), np.float32)
-    blind = 0
+    blind = np.zeros(len(centre), bool)
     for number in np.unique(room):
         members = np.flatnonzero((room == number) & (kind != VOXEL_SOLID))
         available = np.flatnonzero(placement.room == number)
@@ -121,7 +122,7 @@ def _blend(
         sees = _visible(ray_scene, centre[members], placement.position[near], distance)
         blind_member = ~sees.any(axis=1)
         sees[blind_member, 0] = True
-        blind += int(blind_member.sum())
+        blind[members] = blind_member
         rank = np.cumsum(sees, axis=1)
         share = np.where(sees & (rank <= k), 1 / np.maximum(distance, 0.25) ** 2, 0)
         best = np.argsort(-share, axis=1, kind="stable")[:, :k]
@@ -142,10 +143,9 @@ def _visible(ray_scene: RayScene, centre: Float64, probes: Float64, distance: Fl
     return ~blocked.reshape(voxels, candidates)
 
 
-def _nearest_air(kind: UInt8) -> Int64:
-    """For each voxel (flat order), the flat index of the nearest that is not solid; its own where there is none."""
-    solid = kind == VOXEL_SOLID
-    if solid.all():
-        return np.arange(kind.size)
-    nearest = distance_transform_edt(solid, return_distances=False, return_indices=True)
-    return np.ravel_multi_index(tuple(nearest), kind.shape).reshape(-1)
+def _nearest(lit: Bool, shape: tuple[int, int, int]) -> Int64:
+    """For each voxel (flat order), the flat index of the nearest that is lit; its own where none is."""
+    if not lit.any():
+        return np.arange(lit.size)
+    nearest = distance_transform_edt(~lit.reshape(shape), return_distances=False, return_indices=True)
+    return np.ravel_multi_index(tuple(nearest), shape).reshape(-1)

@@ -27,7 +27,7 @@ SAMPLE_OFFSET_M = VOXEL_SIZE_M / 4
 # Neighbouring volumes overlap by 4 voxels along each axis, so that every sample lies between voxel centres even after snapping.
 TILE_M = (np.array([VOLUME_SHAPE[2], VOLUME_SHAPE[0], VOLUME_SHAPE[1]]) - 4) * VOXEL_SIZE_M
 # The pixels that these do not cover are far away and share their nearest volume's edge.
-MAX_VOLUMES = 32
+MAX_VOLUMES = 128
 # Sampling holds some 300 bytes a point: 20 MB.
 SAMPLES_AT_ONCE = 1 << 16
 # What lies beyond the world's edge is drawn as ground of this albedo, in the open; it is not part of the data.
