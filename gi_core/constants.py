@@ -19,5 +19,9 @@ VOXEL_SOLID, VOXEL_OUTDOORS, VOXEL_INDOORS, VOXEL_NO_SECTOR = range(4)
 # Room 0 is outdoors; authored rooms count from 1 in the order of world.toml.
 ROOM_OUTDOORS = 0
 
+# Coefficients per channel of each directional basis (contract): the ambient cube, and spherical harmonics of order 1 and 2.
+BASIS_SIZES = {"cube": 6, "sh1": 4, "sh2": 9}
+MAX_SKY_PATCHES = 1024  # Tregenza's dome has 145, Reinhart's finer one 577
+
 # The directions whose irradiance an ambient cube stores (contract): +X -X +Y -Y +Z -Z.
 CUBE_FACES = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))

@@ -24,7 +24,7 @@ MAGIC = b"SECTORLT"
 _PREFIX = struct.Struct("<8s4sIIIQQ16s8x")  # magic, kind, version, header bytes, zero, payload bytes, raw bytes, digest, zero
 PREFIX_BYTES = _PREFIX.size
 _DIGEST_OFFSET = 40
-_DTYPES = ("u1", "u2", "u4", "i2", "i4", "f2", "f4")
+_DTYPES = ("u1", "u2", "u4", "i1", "i2", "i4", "f2", "f4")
 # Largest array data that a reader accepts: a sector of 1000 probes stays below 64 MiB.
 MAX_RAW_BYTES = 1 << 28
 MAX_HEADER_BYTES = 1 << 20

@@ -5,7 +5,7 @@ Lengths are integers of 1/512 m (2 mm), so that a vertex on a border is the same
 
 import numpy as np
 
-from gi_core.arrays import AnyArray, Float32, Float64, Int32, UInt8, UInt16
+from gi_core.arrays import AnyArray, Float32, Float64, Int8, Int32, UInt8, UInt16
 from gi_core.errors import InputError
 
 STEPS_PER_METRE = 512
@@ -56,6 +56,17 @@ def decode_root(codes: AnyArray) -> Float32:
     """uint8 -> 0..1 float32: (code / 255) squared."""
     root = codes.astype(np.float32) / np.float32(255)
     return root * root
+
+
+def encode_signed_root(values: AnyArray) -> Int8:
+    """-1..1 -> int8, sign and square root of the magnitude."""
+    return (np.sign(values) * np.rint(np.sqrt(np.clip(np.abs(values), 0, 1)) * 127)).astype(np.int8)
+
+
+def decode_signed_root(codes: AnyArray) -> Float32:
+    """int8 -> -1..1 float32: (code / 127) squared, with the code's sign."""
+    root = codes.astype(np.float32) / np.float32(127)
+    return root * np.abs(root)
 
 
 def half_below(values: AnyArray) -> AnyArray:

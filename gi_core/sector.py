@@ -19,7 +19,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from gi_core.arrays import AnyArray, Float32, Int32, Int64, UInt8, UInt16, UInt32
-from gi_core.constants import ALBEDO_MAX, MAX_BRICK_LEVEL, MAX_PROBES_PER_SECTOR
+from gi_core.constants import ALBEDO_MAX, BASIS_SIZES, MAX_BRICK_LEVEL, MAX_PROBES_PER_SECTOR, MAX_SKY_PATCHES
 from gi_core.errors import CorruptFileError
 from gi_core.grid import SectorIndex, voxel_columns
 
@@ -133,6 +133,8 @@ def check_sector(sector: Sector, sky_patches: int) -> None:
         expect((counts(values) >= 0).all(), f"{name} to be non-decreasing")
 
     expect(s.probe_count <= MAX_PROBES_PER_SECTOR, f"at most {MAX_PROBES_PER_SECTOR} probes, got {s.probe_count}")
+    expect(1 <= sky_patches <= MAX_SKY_PATCHES, f"1 to {MAX_SKY_PATCHES} sky patches, got {sky_patches}")
+    expect(s.factor_weight.ndim == 2 and s.basis_size in BASIS_SIZES.values(), f"factor_weight of a basis {BASIS_SIZES}")
     expect_starts(s.factor_starts, s.probe_count, s.factor_count, "factor_starts")
     expect_starts(s.brick_starts, s.brick_count, s.surfel_count, "brick_starts")
     expect((counts(s.brick_starts) > 0).all(), "no empty brick")
@@ -140,7 +142,7 @@ def check_sector(sector: Sector, sky_patches: int) -> None:
         (s.probe_count, "probe_position", (3,)),
         (s.probe_count, "probe_flags", ()),
         (s.probe_count, "probe_room", ()),
-        (s.factor_count, "factor_weight", (6,)),
+        (s.factor_count, "factor_weight", (s.basis_size,)),
         (s.brick_count, "brick_cell", (3,)),
         (s.brick_count, "brick_level", ()),
         (s.surfel_count, "surfel_normal", (3,)),
@@ -175,7 +177,8 @@ def check_sector(sector: Sector, sky_patches: int) -> None:
         if isinstance(values, np.ndarray) and values.dtype.kind == "f":
             expect(np.isfinite(values).all(), f"finite {field.name}")
     # Float32 may round 0.95 and sums up by 6e-8.
-    expect((s.factor_weight >= 0).all() and (s.factor_weight <= 1 + 1e-6).all(), "factor_weight within 0..1")
+    lowest = 0 if s.basis_size == BASIS_SIZES["cube"] else -1 - 1e-6
+    expect((s.factor_weight >= lowest).all() and (s.factor_weight <= 1 + 1e-6).all(), f"factor_weight within {lowest:.0f}..1")
     expect((s.surfel_albedo >= 0).all() and (s.surfel_albedo <= ALBEDO_MAX + 1e-6).all(), f"surfel_albedo within 0..{ALBEDO_MAX}")
     if s.factor_count:
         totals = np.add.reduceat(s.factor_weight, s.factor_starts[:-1][counts(s.factor_starts) > 0], dtype=np.float64)

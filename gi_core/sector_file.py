@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from gi_core import container, quantise
-from gi_core.arrays import AnyArray, Float32, UInt8
-from gi_core.constants import ALBEDO_MAX, BRICK_CELL_M, MAX_BRICK_LEVEL
+from gi_core.arrays import AnyArray, Float32
+from gi_core.constants import ALBEDO_MAX, BASIS_SIZES, BRICK_CELL_M, MAX_BRICK_LEVEL
 from gi_core.container import Container
 from gi_core.errors import CorruptFileError
 from gi_core.grid import SectorIndex
@@ -21,6 +21,10 @@ NO_PROBE = 0xFFFF
 MAX_BLENDED_PROBES = 32
 # A brick's cell is divided into 256 steps: 1.6 cm of 4 m.
 _CELL_STEPS = 256
+_ROOTS = {
+    False: (quantise.encode_root, quantise.decode_root),
+    True: (quantise.encode_signed_root, quantise.decode_signed_root),
+}
 _META = frozenset({"sector", "sky_patches", "voxel_first", "bake"})
 # Fields that are stored under another name: starts as counts, positions within their brick's cell.
 _RENAMED = {"factor_starts": "factor_count", "brick_starts": "brick_count", "surfel_position": "surfel_in_cell"}
@@ -117,24 +121,27 @@ def _probe_of_factor(factor_starts: AnyArray) -> AnyArray:
     return np.repeat(np.arange(len(factor_starts) - 1), counts(factor_starts))
 
 
-def _encode_weights(s: Sector) -> tuple[UInt8, AnyArray]:
-    """Factor weights as uint8 (B, F) codes of their square root, and float16 (2, B, P) scales for bricks and sky.
+def _encode_weights(s: Sector) -> tuple[AnyArray, AnyArray]:
+    """Factor weights as (B, F) codes of their square root, and float16 (2, B, P) scales for bricks and sky.
 
-    A scale is chosen so that each probe's weights still sum to what they did: rounding 8-bit weights moves light between a
+    The cube's are uint8; spherical harmonics have a sign, and int8.
+
+    A scale is chosen so that each probe's weights (their magnitudes) still sum to what they did: rounding moves light between a
     probe's bricks, but neither makes nor loses any.
     """
     basis, probes = s.basis_size, s.probe_count
     row = _is_sky(s) * probes + _probe_of_factor(s.factor_starts)  # bricks first, then sky
-    codes = np.zeros((basis, s.factor_count), np.uint8)
+    signed = basis != BASIS_SIZES["cube"]
+    encode_code, decode_code = _ROOTS[signed]
+    codes = np.zeros((basis, s.factor_count), np.int8 if signed else np.uint8)
     scales = np.zeros((2, basis, probes), np.float16)
     for b in range(basis):
         weight = s.factor_weight[:, b].astype(np.float64)
         top = np.zeros(2 * probes)
-        np.maximum.at(top, row, weight)
-        codes[b] = quantise.encode_root(weight / np.maximum(top[row], 1e-30))
-        decoded = quantise.decode_root(codes[b]).astype(np.float64)
-        kept = np.bincount(row, decoded, 2 * probes)
-        total = np.bincount(row, weight, 2 * probes)
+        np.maximum.at(top, row, np.abs(weight))
+        codes[b] = encode_code(weight / np.maximum(top[row], 1e-30))
+        kept = np.bincount(row, np.abs(decode_code(codes[b]).astype(np.float64)), 2 * probes)
+        total = np.bincount(row, np.abs(weight), 2 * probes)
         scales[:, b] = quantise.half_below(total / np.maximum(kept, 1e-30)).reshape(2, probes)
     return codes, scales
 
@@ -144,7 +151,8 @@ def _decode_weights(codes: AnyArray, scales: AnyArray, factor_starts: AnyArray, 
     if not np.isfinite(scales).all():
         raise CorruptFileError("factor_scale is not finite")
     scale = scales.astype(np.float32)[is_sky.astype(np.int64), :, probe]  # (F, B)
-    return np.ascontiguousarray(quantise.decode_root(codes).T * scale)
+    _, decode_code = _ROOTS[codes.dtype == np.int8]
+    return np.ascontiguousarray(decode_code(codes).T * scale)
 
 
 def _sector(found: Container) -> Sector:
@@ -183,9 +191,7 @@ def _sector(found: Container) -> Sector:
         probe_room=_unsigned(found, "probe_room").astype(np.uint16),
         factor_starts=factor_starts,
         factor_source=source,
-        factor_weight=_decode_weights(
-            take("factor_weight", "u1", 2), take("factor_scale", "f2", 3), factor_starts, source >= len(brick_cell)
-        ),
+        factor_weight=_decode_weights(_weight_codes(found), take("factor_scale", "f2", 3), factor_starts, source >= len(brick_cell)),
         brick_starts=brick_starts,
         brick_level=brick_level,
         brick_cell=brick_cell,
@@ -205,6 +211,12 @@ def _sector(found: Container) -> Sector:
         voxel_probe=np.ascontiguousarray(np.moveaxis(take("voxel_probe", "u2", 4), 0, 3)),
         voxel_weight=np.ascontiguousarray(voxel_weight, np.float32),
     )
+
+
+def _weight_codes(found: Container) -> AnyArray:
+    """factor_weight: (6, F) unsigned for the cube, (4, F) or (9, F) signed for spherical harmonics."""
+    values = found.arrays.get("factor_weight")
+    return found.take("factor_weight", "u1" if values is None or len(values) == BASIS_SIZES["cube"] else "i1", 2)
 
 
 def _unsigned(found: Container, name: str) -> AnyArray:

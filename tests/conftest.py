@@ -35,6 +35,7 @@ def random_sector(
     emits: bool = False,
     voxel_probes: int = 4,
     patches: int = 6,
+    basis: int = 6,
 ) -> Sector:
     """A sector of random numbers that obeys every invariant of gi_core.sector; nothing about it is a real scene."""
     rng = np.random.default_rng(seed)
@@ -52,11 +53,13 @@ def random_sector(
     per_probe = rng.integers(0, 30, probes)
     factors = int(per_probe.sum())
     source = rng.integers(0, len(bricks) + patches, factors).astype(np.uint32)
-    weight = rng.uniform(0, 1, (factors, 6)) ** 4
+    weight = rng.uniform(0, 1, (factors, basis)) ** 4
     probe_of_factor = np.repeat(np.arange(probes), per_probe)
-    for face in range(6):
+    for face in range(basis):
         total = np.bincount(probe_of_factor, weight[:, face], probes)
         weight[:, face] /= np.maximum(total, 1)[probe_of_factor]
+    if basis != 6:
+        weight *= rng.choice([-1, 1], weight.shape)
     shape = (4, 20, 20)
     voxel_weight = rng.uniform(0, 1, (*shape, voxel_probes))
     feedback_weight = rng.uniform(0.1, 1, (surfels, feedback))

@@ -73,6 +73,26 @@ def test_writing_what_was_read_gives_the_same_arrays_but_for_scales(make_sector)
     np.testing.assert_array_equal(once.surfel_albedo, twice.surfel_albedo)
 
 
+@pytest.mark.parametrize("basis", [4, 9])
+@pytest.mark.parametrize("patches", [1, 145, 1024])
+def test_the_file_holds_harmonics_and_any_dome_of_patches(make_sector, basis, patches):
+    sector = make_sector(13, basis=basis, patches=patches)
+    found = sector_file.quantised(sector, patches)
+    np.testing.assert_array_equal(np.sign(found.factor_weight) * np.sign(sector.factor_weight) >= 0, True)
+    probe = np.repeat(np.arange(sector.probe_count), counts(sector.factor_starts))
+    for b in range(basis):
+        top = np.zeros(sector.probe_count)
+        np.maximum.at(top, probe, np.abs(sector.factor_weight[:, b]))
+        # Half a step of 1/127 in the square root is at most 1/127 of the largest weight, and the scale moves by as much again.
+        assert (np.abs(found.factor_weight[:, b] - sector.factor_weight[:, b]) <= 2 * top[probe] / 127 + 1e-6).all()
+
+
+@pytest.mark.parametrize("patches", [0, 1025])
+def test_an_impossible_dome_is_refused(make_sector, patches):
+    with pytest.raises(CorruptFileError, match="sky patches"):
+        sector_file.quantised(make_sector(13), patches)
+
+
 @pytest.mark.parametrize(
     ("array", "change"),
     [
