@@ -9,7 +9,7 @@ import pyopencl as cl
 from gi_core.arrays import AnyArray, Float32
 from gi_core.constants import ALBEDO_MAX
 from gi_core.device import Device
-from gi_core.layout import DIRECTIONAL_LIGHT, MAX_DIRECTIONAL_LIGHTS, SURFEL, VOLUME_BOX
+from gi_core.layout import DIRECTIONAL_LIGHT, MAX_DIRECTIONAL_LIGHTS, SURFEL
 from gi_core.relight_input import RelightInput
 from gi_core.sector import Sector
 
@@ -65,7 +65,6 @@ class ResidentSector:
         self.cubes = device.allocate(sector.probe_count * sector.basis_size * 12)
         self.exitance = device.allocate((sector.brick_count + sky_patches) * 16)
         self.lights = device.allocate(MAX_DIRECTIONAL_LIGHTS * DIRECTIONAL_LIGHT.dtype.itemsize)
-        self.box = device.allocate(VOLUME_BOX.dtype.itemsize)
         self._fill: cl.Kernel | None = None
         self._given: RelightInput | None = None
         self._launches: dict[int, list[Launch]] = {}
@@ -99,8 +98,7 @@ class ResidentSector:
         if self._fill is None:
             sector = self.sector
             self._fill = self.device.kernel("fill_volume", BASIS_SIZE=sector.basis_size, VOXEL_PROBES=sector.voxel_probe.shape[3])
-        cl.enqueue_copy(self.device.queue, self.box, box)
-        self._fill.set_args(self.box, self.voxel_probe, self.voxel_weight, self.cubes, target)
+        self._fill.set_args(box, self.voxel_probe, self.voxel_weight, self.cubes, target)
         cl.enqueue_nd_range_kernel(self.device.queue, self._fill, size, None)
 
     def read_cubes(self) -> Float32:

@@ -16,18 +16,18 @@
 #include "layout.h"
 
 __kernel void fill_volume(
-    __constant VolumeBox *box,
+    const VolumeBox box,
     __global const ushort *voxel_probe,
     __global const float *voxel_weight,
     __global const float *probe_cube,
     __global float *volume)
 {
     const int x = get_global_id(0), y = get_global_id(1), z = get_global_id(2);
-    if (x >= box->box_size[0] || y >= box->box_size[1] || z >= box->box_size[2])
+    if (x >= box.box_size[0] || y >= box.box_size[1] || z >= box.box_size[2])
         return;
-    const int sx = box->sector_first[0] + x, sz = box->sector_first[2] + z;
-    const int sy = clamp(box->sector_first[1] + y, 0, box->sector_size[1] - 1);
-    const uint voxel = ((uint)sy * box->sector_size[2] + sz) * box->sector_size[0] + sx;
+    const int sx = box.sector_first[0] + x, sz = box.sector_first[2] + z;
+    const int sy = clamp(box.sector_first[1] + y, 0, box.sector_size[1] - 1);
+    const uint voxel = ((uint)sy * box.sector_size[2] + sz) * box.sector_size[0] + sx;
     float sum[BASIS_SIZE * 3];
     for (int i = 0; i < BASIS_SIZE * 3; ++i)
         sum[i] = 0.0f;
@@ -37,9 +37,9 @@ __kernel void fill_volume(
         for (int i = 0; i < BASIS_SIZE * 3; ++i)
             sum[i] += weight * cube[i];
     }
-    const uint stride = (uint)box->volume_size[0] * box->volume_size[1] * box->volume_size[2] * 3;
-    const uint at = (((uint)(box->volume_first[1] + y) * box->volume_size[2] + box->volume_first[2] + z) * box->volume_size[0]
-                     + box->volume_first[0] + x) * 3;
+    const uint stride = (uint)box.volume_size[0] * box.volume_size[1] * box.volume_size[2] * 3;
+    const uint at = (((uint)(box.volume_first[1] + y) * box.volume_size[2] + box.volume_first[2] + z) * box.volume_size[0]
+                     + box.volume_first[0] + x) * 3;
     for (int b = 0; b < BASIS_SIZE; ++b)
         for (int c = 0; c < 3; ++c)
             volume[b * stride + at + c] = sum[3 * b + c];
