@@ -18,6 +18,7 @@ SHUTDOWN_GRACE_S = 5
 def run(dataset_path: Path, settings: Settings) -> None:
     """Serve until interrupted; returns normally then. InputError when the address is not to be had."""
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
+    logging.getLogger("pyopencl").setLevel(logging.WARNING)  # it reports how long each first build of a kernel took
     settings.checked()
     # Bound before anything slow, so that a taken port is known at once; listening starts when the application is ready.
     with bind(settings.host, settings.port) as listener:
