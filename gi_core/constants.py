@@ -13,6 +13,9 @@ MAX_BRICK_LEVEL = 7  # cells double at most this often: bricks of 512 m
 # No surface outdoors reflects more than fresh snow does, and the feedback loop must contract: each bounce loses at least 5 %.
 ALBEDO_MAX = 0.95
 
+# Albedo of fresh snow (Warren, "Optical properties of snow", Rev. Geophys. 1982: 0.8 to 0.9 in visible light).
+SNOW_ALBEDO = 0.85
+
 # Voxel classes of ``mask=1`` (contract).
 VOXEL_SOLID, VOXEL_OUTDOORS, VOXEL_INDOORS, VOXEL_NO_SECTOR = range(4)
 

@@ -54,7 +54,8 @@ class ResidentSector:
         self.surfels = device.upload(surfels)
         self.brick_starts = device.upload(sector.brick_starts)
         self.feedback_probe = device.upload(sector.feedback_probe)
-        self.feedback_weight = device.upload(sector.feedback_weight)
+        weighted = sector.feedback_probe.shape[1] > 1 or not (sector.feedback_weight == 1).all()
+        self.feedback_weight = device.upload(sector.feedback_weight) if weighted else None
         self.emission = None if sector.surfel_emission is None else device.upload(sector.surfel_emission)
         self.sun_visibility = device.upload(sector.sun_visibility)
         self.factor_starts = device.upload(sector.factor_starts)
@@ -62,12 +63,14 @@ class ResidentSector:
         self.factor_weight = device.upload(sector.factor_weight)
         self.voxel_probe = device.upload(sector.voxel_probe)
         self.voxel_weight = device.upload(sector.voxel_weight)
-        self.cubes = device.allocate(sector.probe_count * sector.basis_size * 12)
+        self.cubes = device.allocate(sector.probe_count * sector.basis_size * 16)
         self.exitance = device.allocate((sector.brick_count + sky_patches) * 16)
         self.lights = device.allocate(MAX_DIRECTIONAL_LIGHTS * DIRECTIONAL_LIGHT.dtype.itemsize)
         self._fill: cl.Kernel | None = None
         self._given: RelightInput | None = None
-        self._launches: dict[int, list[Launch]] = {}
+        self._has_snow = bool(sector.surfel_snow.any())
+        self._lamps: cl.Buffer | None = None
+        self._launches: dict[tuple[int, bool], list[Launch]] = {}
 
     @property
     def nbytes(self) -> int:
@@ -88,10 +91,22 @@ class ResidentSector:
             if len(given.lights):
                 cl.enqueue_copy(self.device.queue, self.lights, np.ascontiguousarray(given.lights))
             self._given = given
-        count = len(given.lights)
-        if count not in self._launches:
-            self._launches[count] = [*([self._bind_bricks(count)] if self.sector.brick_count else []), self._bind_probes()]
-        return self._launches[count]
+        variant = (len(given.lights), self._has_snow and given.snow > 0)
+        if variant not in self._launches:
+            self._launches[variant] = [*([self._bind_bricks(*variant)] if self.sector.brick_count else []), self._bind_probes()]
+        launches = self._launches[variant]
+        if variant[1] and self.sector.brick_count:
+            launches[0].kernel.set_arg(launches[0].kernel.num_args - 1, np.float32(given.snow))
+        return launches
+
+    def set_lamps(self, surfel_light: cl.Buffer | None) -> None:
+        """Irradiance [lx] that lamps give each surfel: (S, 4) float32 on the device, or None where there are none.
+
+        Read at every pass; its maker may change its contents between passes.
+        """
+        if surfel_light is not self._lamps:
+            self._lamps = surfel_light
+            self._launches.clear()
 
     def fill_volume(self, box: AnyArray, size: tuple[int, ...], target: cl.Buffer) -> None:
         """Enqueue this sector's part of a volume: ``box`` (1,) layout.VOLUME_BOX, its size (x, y, z), the volume's buffer."""
@@ -103,36 +118,42 @@ class ResidentSector:
 
     def read_cubes(self) -> Float32:
         """The probes' cubes (P, B, 3) float32 [lx], after all that was enqueued."""
-        cubes = np.zeros((self.sector.probe_count, self.sector.basis_size, 3), np.float32)
+        cubes = np.zeros((self.sector.probe_count, self.sector.basis_size, 4), np.float32)
         self.device.read(self.cubes, cubes)
-        return cubes
+        return np.ascontiguousarray(cubes[..., :3])
 
     def write_cubes(self, cubes: Float32) -> None:
         """Set the probes' cubes (P, B, 3) float32 [lx]: where the next pass takes its feedback from."""
         if cubes.size:
-            cl.enqueue_copy(self.device.queue, self.cubes, np.ascontiguousarray(cubes, np.float32))
+            padded = np.zeros((*cubes.shape[:2], 4), np.float32)
+            padded[..., :3] = cubes
+            cl.enqueue_copy(self.device.queue, self.cubes, padded)
 
-    def _bind_bricks(self, light_count: int) -> "Launch":
+    def _bind_bricks(self, light_count: int, snow: bool) -> "Launch":
         sector = self.sector
         kernel = self.device.kernel(
             "relight_bricks",
             DIRECTIONAL_LIGHTS=light_count,
             FEEDBACK_PROBES=sector.feedback_probe.shape[1],
+            HAS_FEEDBACK_WEIGHTS=int(self.feedback_weight is not None),
             HAS_EMISSION=int(self.emission is not None),
+            HAS_SNOW=int(snow),
+            HAS_LAMPS=int(self._lamps is not None),
         )
-        arguments: list[Any] = [
-            np.uint32(sector.brick_count),
-            self.brick_starts,
-            self.surfels,
-            self.feedback_probe,
-            self.feedback_weight,
-            self.cubes,
-        ]
+        arguments: list[Any] = [np.uint32(sector.brick_count), self.brick_starts, self.surfels, self.feedback_probe]
+        if self.feedback_weight is not None:
+            arguments.append(self.feedback_weight)
+        arguments.append(self.cubes)
         if self.emission is not None:
             arguments.append(self.emission)
+        if self._lamps is not None:
+            arguments.append(self._lamps)
         if light_count:
             arguments += [self.sun_visibility, np.uint32(sector.sun_visibility.shape[1]), self.lights]
-        kernel.set_args(*arguments, self.exitance)
+        arguments.append(self.exitance)
+        if snow:
+            arguments.append(np.float32(0))  # launches() sets it
+        kernel.set_args(*arguments)
         return Launch(kernel, sector.brick_count)
 
     def _bind_probes(self) -> "Launch":

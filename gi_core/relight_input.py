@@ -18,10 +18,12 @@ _ABOVE_HORIZON = np.where(FACE_DIRECTIONS[:, 1] > 0, 1.0, np.where(FACE_DIRECTIO
 class RelightInput:
     """patch_exitance : (patches, 3) float32 [lx], pi times the mean radiance of each sky patch
     lights : (n,) records of layout.DIRECTIONAL_LIGHT, only those that shine
+    snow : 0..1, how much of each surfel's snow attribute is covered
     """
 
     patch_exitance: Float32
     lights: AnyArray
+    snow: float = 0.0
 
 
 def sky_face_exitance(lighting: Lighting) -> Float32:
@@ -43,4 +45,4 @@ def relight_input(lighting: Lighting, table: SunTable) -> RelightInput:
         record["direction"][:3] = light.direction
         record["irradiance"][:3] = light.irradiance
         record["plane"], record["plane_weight"] = planes, weights
-    return RelightInput(sky_face_exitance(lighting), lights)
+    return RelightInput(sky_face_exitance(lighting), lights, lighting.snow)

@@ -3,15 +3,13 @@
 #ifndef AMBIENT_CUBE_H
 #define AMBIENT_CUBE_H
 
-// Irradiance [lx] on a surface with unit normal (nx, ny, nz). cube: 6 faces of 3 channels.
+#define CUBE_FACES 6
+
+// Irradiance [lx] on a surface with unit normal (n.x, n.y, n.z). cube: 6 faces, each red, green, blue and 0.
 // The squares of the components sum to one, so the result lies between the smallest and the largest face.
-inline float3 evaluate_cube(__global const float *cube, float nx, float ny, float nz)
+inline float4 evaluate_cube(__global const float4 *cube, float4 n)
 {
-    __global const float *x = cube + (nx >= 0.0f ? 0 : 3);
-    __global const float *y = cube + (ny >= 0.0f ? 6 : 9);
-    __global const float *z = cube + (nz >= 0.0f ? 12 : 15);
-    const float wx = nx * nx, wy = ny * ny, wz = nz * nz;
-    return (float3)(wx * x[0] + wy * y[0] + wz * z[0], wx * x[1] + wy * y[1] + wz * z[1], wx * x[2] + wy * y[2] + wz * z[2]);
+    return n.x * n.x * cube[n.x >= 0.0f ? 0 : 1] + n.y * n.y * cube[n.y >= 0.0f ? 2 : 3] + n.z * n.z * cube[n.z >= 0.0f ? 4 : 5];
 }
 
 #endif

@@ -19,7 +19,7 @@ __kernel void fill_volume(
     const VolumeBox box,
     __global const ushort *voxel_probe,
     __global const float *voxel_weight,
-    __global const float *probe_cube,
+    __global const float4 *probe_cube,
     __global float *volume)
 {
     const int x = get_global_id(0), y = get_global_id(1), z = get_global_id(2);
@@ -28,19 +28,18 @@ __kernel void fill_volume(
     const int sx = box.sector_first[0] + x, sz = box.sector_first[2] + z;
     const int sy = clamp(box.sector_first[1] + y, 0, box.sector_size[1] - 1);
     const uint voxel = ((uint)sy * box.sector_size[2] + sz) * box.sector_size[0] + sx;
-    float sum[BASIS_SIZE * 3];
-    for (int i = 0; i < BASIS_SIZE * 3; ++i)
-        sum[i] = 0.0f;
+    float4 sum[BASIS_SIZE];
+    for (int b = 0; b < BASIS_SIZE; ++b)
+        sum[b] = (float4)(0.0f);
     for (int k = 0; k < VOXEL_PROBES; ++k) {
         const float weight = voxel_weight[voxel * VOXEL_PROBES + k];
-        __global const float *cube = probe_cube + (uint)voxel_probe[voxel * VOXEL_PROBES + k] * BASIS_SIZE * 3;
-        for (int i = 0; i < BASIS_SIZE * 3; ++i)
-            sum[i] += weight * cube[i];
+        __global const float4 *cube = probe_cube + (uint)voxel_probe[voxel * VOXEL_PROBES + k] * BASIS_SIZE;
+        for (int b = 0; b < BASIS_SIZE; ++b)
+            sum[b] += weight * cube[b];
     }
-    const uint stride = (uint)box.volume_size[0] * box.volume_size[1] * box.volume_size[2] * 3;
-    const uint at = (((uint)(box.volume_first[1] + y) * box.volume_size[2] + box.volume_first[2] + z) * box.volume_size[0]
-                     + box.volume_first[0] + x) * 3;
+    const uint voxels = (uint)box.volume_size[0] * box.volume_size[1] * box.volume_size[2];
+    const uint at = ((uint)(box.volume_first[1] + y) * box.volume_size[2] + box.volume_first[2] + z) * box.volume_size[0]
+                    + box.volume_first[0] + x;
     for (int b = 0; b < BASIS_SIZE; ++b)
-        for (int c = 0; c < 3; ++c)
-            volume[b * stride + at + c] = sum[3 * b + c];
+        vstore3(sum[b].xyz, b * voxels + at, volume);
 }

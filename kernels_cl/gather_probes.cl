@@ -16,25 +16,20 @@ __kernel void gather_probes(
     __global const uint *factor_source,
     __global const float *factor_weight,
     __global const float4 *exitance,
-    __global float *probe_cube)
+    __global float4 *probe_cube)
 {
     const uint probe = get_global_id(0);
     if (probe >= probes)
         return;
-    float sum[BASIS_SIZE * 3];
-    for (int i = 0; i < BASIS_SIZE * 3; ++i)
-        sum[i] = 0.0f;
+    float4 sum[BASIS_SIZE];
+    for (int b = 0; b < BASIS_SIZE; ++b)
+        sum[b] = (float4)(0.0f);
     const uint end = factor_starts[probe + 1];
     for (uint f = factor_starts[probe]; f < end; ++f) {
         const float4 source = exitance[factor_source[f]];
-        __global const float *weight = factor_weight + f * BASIS_SIZE;
-        for (int b = 0; b < BASIS_SIZE; ++b) {
-            sum[3 * b] += weight[b] * source.x;
-            sum[3 * b + 1] += weight[b] * source.y;
-            sum[3 * b + 2] += weight[b] * source.z;
-        }
+        for (int b = 0; b < BASIS_SIZE; ++b)
+            sum[b] += factor_weight[f * BASIS_SIZE + b] * source;
     }
-    __global float *out = probe_cube + probe * BASIS_SIZE * 3;
-    for (int i = 0; i < BASIS_SIZE * 3; ++i)
-        out[i] = sum[i];
+    for (int b = 0; b < BASIS_SIZE; ++b)
+        probe_cube[probe * BASIS_SIZE + b] = sum[b];
 }

@@ -4,6 +4,7 @@
 
 #define MAX_DIRECTIONAL_LIGHTS 2
 #define PLANES_PER_LIGHT 4
+#define SNOW_ALBEDO 0.85f
 
 // What relighting needs of a surfel; feedback probes and sun bits are arrays of their own.
 typedef struct {

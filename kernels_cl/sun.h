@@ -5,13 +5,13 @@
 #include "layout.h"
 
 // Share of a directional light that reaches a surfel: the baked directions around the light, blended.
-// A plane holds one bit per surfel, `words` words long.
-inline float directional_visibility(__global const uint *sun_visibility, uint words, uint surfel, __constant DirectionalLight *light)
+// A plane holds one bit per surfel. `plane` are the light's four planes.
+inline float directional_visibility(__global const uint *const *plane, __constant const DirectionalLight *light, uint surfel)
 {
     const uint word = surfel >> 5, bit = surfel & 31;
     float visibility = 0.0f;
     for (int i = 0; i < PLANES_PER_LIGHT; ++i)
-        visibility += light->plane_weight[i] * (float)((sun_visibility[light->plane[i] * words + word] >> bit) & 1);
+        visibility += light->plane_weight[i] * (float)((plane[i][word] >> bit) & 1);
     return visibility;
 }
 

@@ -24,7 +24,7 @@ def device(request) -> Device:
     return shared_device(request.param)
 
 
-def given_light(seed: int, lights: int, planes: int = 12) -> RelightInput:
+def given_light(seed: int, lights: int, planes: int = 12, snow: float = 0.0) -> RelightInput:
     rng = np.random.default_rng(seed)
     records = np.zeros(lights, DIRECTIONAL_LIGHT.dtype)
     for record in records:
@@ -34,7 +34,7 @@ def given_light(seed: int, lights: int, planes: int = 12) -> RelightInput:
         record["plane"] = rng.integers(0, planes, 4)
         weight = rng.uniform(0, 1, 4)
         record["plane_weight"] = weight / weight.sum()
-    return RelightInput(rng.uniform(0, 2e4, (PATCHES, 3)).astype(np.float32), records)
+    return RelightInput(rng.uniform(0, 2e4, (PATCHES, 3)).astype(np.float32), records, snow)
 
 
 SHAPES = [
@@ -61,6 +61,37 @@ def test_three_passes_equal_the_twins(device, make_sector, shape, lights):
     expected = relight_twin.relight(sector, given, start, 3)
     peak = expected.max(initial=1e-9)
     np.testing.assert_allclose(resident.read_cubes() / peak, expected / peak, atol=CLOSE)
+
+
+@pytest.mark.parametrize("snow", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize("lamps", [False, True])
+def test_snow_and_lamps_equal_the_twins(device, make_sector, snow, lamps):
+    sector, given = make_sector(14), given_light(14, 1, snow=snow)
+    resident = ResidentSector(device, sector, PATCHES)
+    light = np.zeros((sector.surfel_count, 4), np.float32)
+    light[:, :3] = np.random.default_rng(14).uniform(0, 1e5, (sector.surfel_count, 3))
+    if lamps:
+        resident.set_lamps(device.upload(light))
+    found = Relighter(device).converge(resident, given).cubes
+    truth = relight_twin.solve(sector, given, lamps=light[:, :3] if lamps else None)
+    assert np.abs(found - truth).max() <= 1e-4 * truth.max()
+
+
+def test_snow_comes_and_goes_without_a_trace(device, make_sector):
+    resident = ResidentSector(device, make_sector(15), PATCHES)
+    before = Relighter(device).converge(resident, given_light(15, 1)).cubes.tobytes()
+    for snow in (0.2, 1.0):
+        assert Relighter(device).converge(resident, given_light(15, 1, snow=snow)).cubes.tobytes() != before
+    assert Relighter(device).converge(resident, given_light(15, 1)).cubes.tobytes() == before
+
+
+def test_lamps_come_and_go_without_a_trace(device, make_sector):
+    resident, given = ResidentSector(device, make_sector(16), PATCHES), given_light(16, 1)
+    before = Relighter(device).converge(resident, given).cubes.tobytes()
+    resident.set_lamps(device.upload(np.full((resident.sector.surfel_count, 4), 500, np.float32)))
+    assert Relighter(device).converge(resident, given).cubes.tobytes() != before
+    resident.set_lamps(None)
+    assert Relighter(device).converge(resident, given).cubes.tobytes() == before
 
 
 def test_two_sectors_in_one_call_equal_each_alone(device, make_sector):
@@ -150,7 +181,7 @@ def test_a_kernel_that_does_not_build_shows_the_compilers_words(device):
 
 def test_a_missing_define_stops_the_build(device):
     with pytest.raises(KernelBuildError, match="FEEDBACK_PROBES"):
-        device.kernel("relight_bricks", DIRECTIONAL_LIGHTS=1, HAS_EMISSION=0)
+        device.kernel("relight_bricks", DIRECTIONAL_LIGHTS=1, HAS_EMISSION=0, HAS_SNOW=0, HAS_LAMPS=0, HAS_FEEDBACK_WEIGHTS=0)
 
 
 @pytest.mark.parametrize(
