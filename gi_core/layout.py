@@ -16,6 +16,16 @@ from gi_core.constants import SNOW_ALBEDO
 MAX_DIRECTIONAL_LIGHTS = 2
 # Sun visibility blends the four baked directions around the sun.
 PLANES_PER_LIGHT = 4
+# Values of LocalLight.kind.
+LOCAL_POINT, LOCAL_SPOT, LOCAL_AREA = range(3)
+# Shadow rays to an area light, one to the middle of each quarter; points and spots take one.
+AREA_SHADOW_RAYS = 4
+# A lamp has a size: closer than this [m] its light grows no more. Else a surfel where the lamp hangs would take infinity.
+LAMP_RADIUS_M = 0.05
+# Shadow rays start this far off a surfel [m], whose position is a mean of hits and may lie a little below the surface,
+SHADOW_START_M = 0.05
+# and end this far before the lamp, so that a lamp on a ceiling or a wall is not hidden by it.
+SHADOW_END_M = 0.02
 
 _SCALARS = {"float": "f4", "uint": "u4", "int": "i4"}
 
@@ -65,11 +75,51 @@ VOLUME_BOX = Record(
         ("sector_size", "int", 4),
     ),
 )
-RECORDS = (SURFEL, DIRECTIONAL_LIGHT, VOLUME_BOX)
+SURFEL_PLACE = Record(
+    "SurfelPlace",
+    "Where a surfel is [m], sector-local, and its unit normal: what local lights need of it.",
+    (("position", "float", 3), ("padding_a", "float", 1), ("normal", "float", 3), ("padding_b", "float", 1)),
+)
+LOCAL_LIGHT = Record(
+    "LocalLight",
+    "A lamp, sector-local [m]. intensity [cd], or an area's radiance [cd m^-2]; axis and halves as gi_core/lights.py defines them.",
+    (
+        ("position", "float", 3),
+        ("range", "float", 1),
+        ("intensity", "float", 3),
+        ("cos_outer", "float", 1),
+        ("axis", "float", 3),
+        ("cos_inner", "float", 1),
+        ("half_u", "float", 3),
+        ("kind", "uint", 1),
+        ("half_v", "float", 3),
+        ("first_plane", "uint", 1),
+    ),
+)
+SHADOW_TRIANGLE = Record(
+    "ShadowTriangle",
+    "A corner and the two edges that leave it [m], sector-local.",
+    (
+        ("corner", "float", 3),
+        ("padding_a", "float", 1),
+        ("edge_a", "float", 3),
+        ("padding_b", "float", 1),
+        ("edge_b", "float", 3),
+        ("padding_c", "float", 1),
+    ),
+)
+RECORDS = (SURFEL, DIRECTIONAL_LIGHT, VOLUME_BOX, SURFEL_PLACE, LOCAL_LIGHT, SHADOW_TRIANGLE)
 CONSTANTS: dict[str, int | float] = {
     "MAX_DIRECTIONAL_LIGHTS": MAX_DIRECTIONAL_LIGHTS,
     "PLANES_PER_LIGHT": PLANES_PER_LIGHT,
     "SNOW_ALBEDO": SNOW_ALBEDO,
+    "LOCAL_POINT": LOCAL_POINT,
+    "LOCAL_SPOT": LOCAL_SPOT,
+    "LOCAL_AREA": LOCAL_AREA,
+    "AREA_SHADOW_RAYS": AREA_SHADOW_RAYS,
+    "LAMP_RADIUS_M": LAMP_RADIUS_M,
+    "SHADOW_START_M": SHADOW_START_M,
+    "SHADOW_END_M": SHADOW_END_M,
 }
 
 

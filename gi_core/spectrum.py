@@ -54,6 +54,14 @@ def _rgb_from_spectrum() -> Float64:
 RGB_FROM_SPECTRUM = _rgb_from_spectrum()
 
 
+def rgb_of_black_body(kelvin: float) -> Float64:
+    """Linear sRGB (3,) of luminance 1 of a black body; negative where a channel cannot show it (below about 1900 K)."""
+    fine = np.arange(380.0, 781.0)
+    planck = fine**-5 / np.expm1(1.438777e7 / (fine * kelvin))
+    xyz = (colour_matching(fine) * planck[:, None]).sum(axis=0)
+    return np.asarray(_RGB_FROM_XYZ @ (xyz / xyz[1]), np.float64)
+
+
 def rayleigh_depth() -> Float64:
     """(8,) vertical optical depth of clean air above the sea. Hansen and Travis 1974, eq. 2.30."""
     micron = WAVELENGTH_NM / 1000

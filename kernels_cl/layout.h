@@ -5,6 +5,13 @@
 #define MAX_DIRECTIONAL_LIGHTS 2
 #define PLANES_PER_LIGHT 4
 #define SNOW_ALBEDO 0.85f
+#define LOCAL_POINT 0
+#define LOCAL_SPOT 1
+#define LOCAL_AREA 2
+#define AREA_SHADOW_RAYS 4
+#define LAMP_RADIUS_M 0.05f
+#define SHADOW_START_M 0.05f
+#define SHADOW_END_M 0.02f
 
 // What relighting needs of a surfel; feedback probes and sun bits are arrays of their own.
 typedef struct {
@@ -30,5 +37,37 @@ typedef struct {
     int sector_first[4];
     int sector_size[4];
 } VolumeBox;
+
+// Where a surfel is [m], sector-local, and its unit normal: what local lights need of it.
+typedef struct {
+    float position[3];
+    float padding_a;
+    float normal[3];
+    float padding_b;
+} SurfelPlace;
+
+// A lamp, sector-local [m]. intensity [cd], or an area's radiance [cd m^-2]; axis and halves as gi_core/lights.py defines them.
+typedef struct {
+    float position[3];
+    float range;
+    float intensity[3];
+    float cos_outer;
+    float axis[3];
+    float cos_inner;
+    float half_u[3];
+    uint kind;
+    float half_v[3];
+    uint first_plane;
+} LocalLight;
+
+// A corner and the two edges that leave it [m], sector-local.
+typedef struct {
+    float corner[3];
+    float padding_a;
+    float edge_a[3];
+    float padding_b;
+    float edge_b[3];
+    float padding_c;
+} ShadowTriangle;
 
 #endif
