@@ -24,7 +24,7 @@ def directional_irradiance(sector: Sector, given: RelightInput, dtype: Any = np.
     """Sun and moon on each surfel: (S, 3) [lx]. It does not change from pass to pass."""
     total = np.zeros((sector.surfel_count, 3), dtype)
     for light in given.lights:
-        cosine = np.maximum(sector.surfel_normal.astype(dtype) @ light["direction"][:3].astype(dtype), 0)
+        cosine = np.maximum(np.einsum("sa,a->s", sector.surfel_normal.astype(dtype), light["direction"][:3].astype(dtype)), 0)
         visibility = np.zeros(sector.surfel_count, dtype)
         for plane, weight in zip(light["plane"], light["plane_weight"], strict=True):
             visibility += dtype(weight) * sun_bits(sector, int(plane))

@@ -29,17 +29,20 @@ __kernel void fill_volume(
     const int sy = clamp(box.sector_first[1] + y, 0, box.sector_size[1] - 1);
     const uint voxel = ((uint)sy * box.sector_size[2] + sz) * box.sector_size[0] + sx;
     float4 sum[BASIS_SIZE];
+    __attribute__((opencl_unroll_hint(BASIS_SIZE)))
     for (int b = 0; b < BASIS_SIZE; ++b)
         sum[b] = (float4)(0.0f);
     for (int k = 0; k < VOXEL_PROBES; ++k) {
         const float weight = voxel_weight[voxel * VOXEL_PROBES + k];
         __global const float4 *cube = probe_cube + (uint)voxel_probe[voxel * VOXEL_PROBES + k] * BASIS_SIZE;
+        __attribute__((opencl_unroll_hint(BASIS_SIZE)))
         for (int b = 0; b < BASIS_SIZE; ++b)
             sum[b] += weight * cube[b];
     }
     const uint voxels = (uint)box.volume_size[0] * box.volume_size[1] * box.volume_size[2];
     const uint at = ((uint)(box.volume_first[1] + y) * box.volume_size[2] + box.volume_first[2] + z) * box.volume_size[0]
                     + box.volume_first[0] + x;
+    __attribute__((opencl_unroll_hint(BASIS_SIZE)))
     for (int b = 0; b < BASIS_SIZE; ++b)
         vstore3(sum[b].xyz, b * voxels + at, volume);
 }

@@ -68,6 +68,7 @@ __kernel void relight_bricks(
     const uint first = brick_starts[brick], end = brick_starts[brick + 1];
 #if DIRECTIONAL_LIGHTS > 0
     __global const uint *planes[DIRECTIONAL_LIGHTS * PLANES_PER_LIGHT];
+    __attribute__((opencl_unroll_hint(DIRECTIONAL_LIGHTS * PLANES_PER_LIGHT)))
     for (int i = 0; i < DIRECTIONAL_LIGHTS * PLANES_PER_LIGHT; ++i)
         planes[i] = sun_visibility + lights[i / PLANES_PER_LIGHT].plane[i % PLANES_PER_LIGHT] * words;
 #endif
@@ -81,6 +82,7 @@ __kernel void relight_bricks(
 #endif
         float4 irradiance = (float4)(0.0f);
 #if DIRECTIONAL_LIGHTS > 0
+        __attribute__((opencl_unroll_hint(DIRECTIONAL_LIGHTS)))
         for (int i = 0; i < DIRECTIONAL_LIGHTS; ++i) {
             const float cosine = normal.x * lights[i].direction[0] + normal.y * lights[i].direction[1] + normal.z * lights[i].direction[2];
             const float lit = fmax(cosine, 0.0f) * directional_visibility(planes + i * PLANES_PER_LIGHT, lights + i, s);

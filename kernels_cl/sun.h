@@ -10,6 +10,7 @@ inline float directional_visibility(__global const uint *const *plane, __constan
 {
     const uint word = surfel >> 5, bit = surfel & 31;
     float visibility = 0.0f;
+    __attribute__((opencl_unroll_hint(PLANES_PER_LIGHT)))
     for (int i = 0; i < PLANES_PER_LIGHT; ++i)
         visibility += light->plane_weight[i] * (float)((plane[i][word] >> bit) & 1);
     return visibility;
