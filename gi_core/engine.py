@@ -18,6 +18,7 @@ from gi_core.lighting_model import make_lighting
 from gi_core.relight import Relighter, ResidentSector
 from gi_core.relight_input import relight_input, sky_face_exitance
 from gi_core.sector import PROBE_IN_MARGIN
+from gi_core.settings import NEUTRAL, Settings
 from gi_core.volume import SectorBox, Volume, box_mask, box_record, fill_missing_columns, plan_boxes
 
 # Device memory that queries may keep sectors in.
@@ -64,7 +65,7 @@ class Engine:
         self._relighter = Relighter(self._device)
         self._lock = threading.RLock()
         self._residents: OrderedDict[SectorIndex, ResidentSector] = OrderedDict()
-        self._lit: OrderedDict[tuple[str, SectorIndex], Float32] = OrderedDict()
+        self._lit: OrderedDict[tuple[str, Settings, SectorIndex], Float32] = OrderedDict()
 
     @property
     def device_name(self) -> str:
@@ -75,18 +76,20 @@ class Engine:
         """Sun, moon and sky at the dataset's place. Raises UnknownTimeError, UnknownWeatherError."""
         return make_lighting(self.dataset.world.location, time, weather)
 
-    def lit_sector(self, index: SectorIndex, lighting: Lighting) -> Float32:
+    def lit_sector(self, index: SectorIndex, lighting: Lighting, settings: Settings = NEUTRAL) -> Float32:
         """A sector's probe cubes (P, 6, 3) float32 [lx], bounces converged to relight.QUERY_RESIDUAL.
 
         Raises SectorMissingError, CorruptFileError.
         """
-        key = (lighting.digest, index)
+        key = (lighting.digest, settings, index)
         with self._lock:
             if key in self._lit:
                 self._lit.move_to_end(key)
                 return self._lit[key]
             resident = self._resident(index)
-            cubes = self._relighter.converge(resident, relight_input(lighting, self.dataset.world.sun_table)).cubes
+            given = relight_input(settings.light(lighting), self.dataset.world.sun_table)
+            found = self._relighter.converge(resident, given)
+            cubes = settings.cubes(found.first_bounce, found.cubes, resident.sector.probe_room)
             # Every later query gets this very array.
             cubes.setflags(write=False)
             self._lit[key] = cubes
@@ -94,8 +97,8 @@ class Engine:
                 self._lit.popitem(last=False)
             return cubes
 
-    def volume(self, position: Float64, lighting: Lighting) -> Volume:
-        """The volume centred on a world position (3,) [m]. Raises OutsideWorldError, CorruptFileError."""
+    def volume(self, position: Float64, lighting: Lighting, settings: Settings = NEUTRAL) -> Volume:
+        """The volume centred on a world position (3,) [m], under the artists' settings. Raises OutsideWorldError, CorruptFileError."""
         self._expect_inside(position)
         first = volume_first_voxel(position)
         boxes = [box for box in plan_boxes(first) if box.index in self.dataset.world.sectors]
@@ -105,7 +108,7 @@ class Engine:
         mask = np.full(VOLUME_SHAPE, VOXEL_NO_SECTOR, np.uint8)
         with self._lock:
             target = self._device.allocate(values.nbytes)
-            unlit = [box for box in boxes if not self._fill(box, lighting, target, mask)]
+            unlit = [box for box in boxes if not self._fill(box, lighting, settings, target, mask)]
             self._device.read(target, values)
         lit_mask = mask.copy()
         for box in unlit:  # it has air, but no probe: lit like columns without a sector, by the nearest that are
@@ -145,9 +148,9 @@ class Engine:
         position_, cubes_, room, flags = (np.concatenate([part[i] for part in found]) for i in range(4))
         return LitProbes(position_, cubes_, room, flags, tuple(s for part in found for s in part[4]))
 
-    def _fill(self, box: SectorBox, lighting: Lighting, target: cl.Buffer, mask: UInt8) -> bool:
+    def _fill(self, box: SectorBox, lighting: Lighting, settings: Settings, target: cl.Buffer, mask: UInt8) -> bool:
         """Fill a sector's part of a volume and its mask; whether the sector has a probe, and so any light."""
-        cubes = self.lit_sector(box.index, lighting)
+        cubes = self.lit_sector(box.index, lighting, settings)
         resident = self._resident(box.index)
         sector = resident.sector
         resident.write_cubes(cubes)

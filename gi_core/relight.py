@@ -28,9 +28,16 @@ GROUP = 16
 
 @dataclass(frozen=True)
 class Converged:
-    """cubes : (P, B, 3) float32 [lx]; residual : estimated distance to the fixed point as a share of the peak; passes : how many ran."""
+    """What a query's bounces came to.
+
+    cubes : (P, B, 3) float32 [lx]
+    first_bounce : (P, B, 3) float32 [lx], sky and the first surface alone: what one pass from darkness gives
+    residual : estimated distance to the fixed point as a share of the peak
+    passes : how many ran
+    """
 
     cubes: Float32
+    first_bounce: Float32
     residual: float
     passes: int
 
@@ -192,9 +199,11 @@ class Relighter:
         sector = resident.sector
         after = np.zeros((sector.probe_count, sector.basis_size, 3), np.float32)
         if sector.probe_count == 0:
-            return Converged(after, 0.0, 0)
+            return Converged(after, after, 0.0, 0)
         resident.write_cubes(after)
-        passes, left, last_change = 0, 0.0, 0.0
+        self.relight([resident], given, 1)
+        first = resident.read_cubes()
+        passes, left, last_change = 1, 0.0, 0.0
         while passes < MAX_PASSES:
             self.relight([resident], given, _PASSES_PER_LOOK - 1)
             before = resident.read_cubes()
@@ -203,9 +212,9 @@ class Relighter:
             passes += _PASSES_PER_LOOK
             peak, change = float(np.abs(after).max()), float(np.abs(after - before).max())
             if change <= np.finfo(np.float32).eps * peak:
-                return Converged(after, 0.0, passes)
+                return Converged(after, first, 0.0, passes)
             rate = min((change / last_change) ** (1 / _PASSES_PER_LOOK), _SLOWEST_RATE) if last_change else _SLOWEST_RATE
             left, last_change = change * rate / (1 - rate) / peak, change
             if left <= residual:
                 break
-        return Converged(after, left, passes)
+        return Converged(after, first, left, passes)

@@ -1,0 +1,87 @@
+"""The artists' panel (slide "Ease of use"): nine numbers, each with a physical meaning and a neutral default.
+
+Light transport is linear, so gains on the sources are gains on what they give, and none of them touches the loop of bounces: no
+setting can make it diverge. The bounce gain acts on the sum of all bounces after it has converged.
+"""
+
+import math
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from gi_core.arrays import Float32, UInt16
+from gi_core.constants import ROOM_OUTDOORS
+from gi_core.errors import InputError
+from gi_core.lighting import DirectionalLight, Lighting
+
+# Beyond this a picture is white whatever the scene; float32 holds noon times this with room to spare.
+MAX_FACTOR = 100.0
+MAX_AMBIENT_LX = 1e6
+Color = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The panel. Every default is neutral: it changes no byte of the answer.
+
+    bounce_factor : gain on light that has met two surfaces or more [1]; 0 shows the first bounce alone
+    sky_factor : gain on the sky's light, bounced light of it included [1]
+    sun_factor : gain on sun and moon, likewise [1]
+    lights_factor : gain on lamps, likewise [1]
+    sky_boost : uniform radiance added to the sky above the horizon, per channel [cd m^-2]; lifts places that see little of it
+    ambient_factor : gain on the two ambient colours [1]
+    ambient_up, ambient_down : irradiance added on faces that look up and down, sides take their mean [lx]; no surface casts or stops it
+    exterior_ambient_scale, interior_ambient_scale : gain on the ambient colours outdoors, and in rooms [1]
+    """
+
+    bounce_factor: float = 1.0
+    sky_factor: float = 1.0
+    sun_factor: float = 1.0
+    lights_factor: float = 1.0
+    sky_boost: Color = (0.0, 0.0, 0.0)
+    ambient_factor: float = 1.0
+    ambient_up: Color = (0.0, 0.0, 0.0)
+    ambient_down: Color = (0.0, 0.0, 0.0)
+    exterior_ambient_scale: float = 1.0
+    interior_ambient_scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            numbers, most = (value, MAX_AMBIENT_LX) if isinstance(value, tuple) else ((value,), MAX_FACTOR)
+            if len(numbers) not in (1, 3) or not all(math.isfinite(n) and 0 <= n <= most for n in numbers):
+                what = "three numbers" if isinstance(value, tuple) else "a number"
+                raise InputError(f"settings: {field.name}: expected {what} from 0 to {most:g}, got {value}")
+
+    def light(self, lighting: Lighting) -> Lighting:
+        """A snapshot with the sources' gains and the sky boost applied."""
+        if (self.sky_factor, self.sun_factor, *self.sky_boost) == (1.0, 1.0, 0.0, 0.0, 0.0):
+            return lighting
+
+        def dimmed(light: DirectionalLight) -> DirectionalLight:
+            return replace(light, irradiance=light.irradiance * self.sun_factor)
+
+        boost = np.array(self.sky_boost)
+        sky = lighting.sky_radiance * np.float32(self.sky_factor)
+        upper = len(sky) // 2
+        sky[:upper] += boost.astype(np.float32)
+        # A uniform sky of radiance L gives pi L from above, half of it on the sides, nothing from below.
+        seen = np.pi * np.array([0.5, 0.5, 1.0, 0.0, 0.5, 0.5])[:, None]
+        cube = lighting.sky_cube * self.sky_factor + seen * boost
+        return replace(lighting, sun=dimmed(lighting.sun), moon=dimmed(lighting.moon), sky_radiance=sky, sky_cube=cube)
+
+    def cubes(self, first_bounce: Float32, converged: Float32, room: UInt16) -> Float32:
+        """Probe cubes (P, 6, 3) [lx] from those with one bounce and with all, and each probe's room (P,)."""
+        cubes = converged
+        if self.bounce_factor != 1.0:
+            cubes = first_bounce + np.float32(self.bounce_factor) * (converged - first_bounce)
+        up, down = (np.array(c) * self.ambient_factor for c in (self.ambient_up, self.ambient_down))
+        if up.any() or down.any():
+            side = (up + down) / 2
+            ambient = np.stack([side, side, up, down, side, side]).astype(np.float32)
+            scale = np.where(room == ROOM_OUTDOORS, self.exterior_ambient_scale, self.interior_ambient_scale).astype(np.float32)
+            cubes = cubes + scale[:, None, None] * ambient
+        return cubes
+
+
+NEUTRAL = Settings()
