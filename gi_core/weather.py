@@ -8,6 +8,7 @@ overcast:0.5,snow=0.2            both
 
 import math
 import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
@@ -86,6 +87,14 @@ def parse_weather(text: str) -> Weather:
     changed = {key: value for key, value in sorted(overrides.items()) if value != values[key]}
     options = [repr(strength)] * (strength != 1.0) + [f"{key}={value!r}" for key, value in changed.items()]
     return Weather(name + ":" * bool(options) + ",".join(options), **{**values, **changed})
+
+
+def weather_of(numbers: Mapping[str, float]) -> Weather:
+    """The weather of numbers by their names; those of ``clear`` where one is left out. Its text reads back as the same weather.
+
+    Raises UnknownWeatherError for other names, and for numbers out of range.
+    """
+    return parse_weather("clear:" + ",".join(f"{name}={float(value)!r}" for name, value in numbers.items()) if numbers else "clear")
 
 
 def as_weather(weather: Weather | str) -> Weather:
