@@ -3,9 +3,10 @@
 "Talk size" is the average sector of the talk's Manhattan: 294 probes, 14 355 surfels, 29 400 factors.
 """
 
+import itertools
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -119,15 +120,9 @@ def daylight() -> RelightInput:
 
 def bench_relight(device: Device, rounds: int = 15) -> Measurement:
     """One tick's relight of two sectors, host overhead included: sun, sky and one bounce. Baseline: the NumPy twin in float32."""
-    given, relighter = daylight(), Relighter(device)
+    given = daylight()
     residents = [ResidentSector(device, talk_size_sector(seed), SKY_PATCHES) for seed in range(ROTATION)]
-    turn = 0
-
-    def tick() -> None:
-        nonlocal turn
-        relighter.relight([residents[turn % ROTATION], residents[(turn + 1) % ROTATION]], given)
-        device.queue.finish()
-        turn += 2
+    tick = _ticks(device, residents, given)
 
     def twin() -> None:
         for resident in residents[:2]:
@@ -138,6 +133,60 @@ def bench_relight(device: Device, rounds: int = 15) -> Measurement:
     return Measurement(
         "relight_two_sectors", milliseconds, "ms", baseline, baseline / milliseconds, sizes, device.name, "NumPy twin, float32"
     )
+
+
+def bench_features(device: Device, rounds: int = 8) -> list[Measurement]:
+    """What each feature of the relighter adds to a tick of two sectors: with it, beside the same tick without it.
+
+    ``bytes_added`` is what the two sectors hold on the device for it. Without a feature its kernels have no code for it, and there is
+    no buffer: the baseline is then a tick that never knew of it.
+    """
+    plain = [talk_size_sector(seed) for seed in range(ROTATION)]
+    rng = np.random.default_rng(0)
+    shining = [replace(s, surfel_emission=rng.uniform(0, 10, (s.surfel_count, 3)).astype(np.float32)) for s in plain]
+    snowy = [replace(s, surfel_snow=rng.uniform(0, 1, s.surfel_count).astype(np.float32)) for s in plain]
+    day, dark = daylight(), RelightInput(daylight().patch_exitance, daylight().lights[:0])
+    both = RelightInput(day.patch_exitance, np.concatenate([day.lights, day.lights]))
+    lit = [device.upload(np.ones((s.surfel_count, 4), np.float32)) for s in plain]
+
+    def feature(name: str, given: RelightInput, without: RelightInput, sectors: list[Sector], lamps: bool = False) -> Measurement:
+        on, off = ([ResidentSector(device, s, SKY_PATCHES) for s in group] for group in (sectors, plain))
+        if lamps:
+            for resident, buffer in zip(on, lit, strict=True):
+                resident.set_lamps(buffer)
+        added = sum(r.nbytes for r in on[:2]) - sum(r.nbytes for r in off[:2])
+        times = side_by_side(_ticks(device, on, given), _ticks(device, off, without), 20 * rounds)
+        with_it, without_it = (1e3 * s for s in times)
+        return Measurement(
+            f"feature_{name}",
+            with_it,
+            "ms",
+            without_it,
+            without_it / with_it,
+            {"bytes_added": added},
+            device.name,
+            "the same tick without it",
+        )
+
+    return [
+        feature("sun", day, dark, plain),
+        feature("moon_beside_sun", both, day, plain),
+        feature("snow", RelightInput(day.patch_exitance, day.lights, 0.5), day, snowy),
+        feature("lamps", day, day, plain, lamps=True),
+        feature("emission", day, day, shining),
+    ]
+
+
+def _ticks(device: Device, residents: list[ResidentSector], given: RelightInput) -> Callable[[], None]:
+    """A function that relights two of the sectors at each call, in rotation, and waits."""
+    relighter, turns = Relighter(device), itertools.count()
+
+    def tick() -> None:
+        turn = 2 * next(turns)
+        relighter.relight([residents[turn % ROTATION], residents[(turn + 1) % ROTATION]], given)
+        device.queue.finish()
+
+    return tick
 
 
 def bench_volume(device: Device, rounds: int = 100) -> Measurement:
@@ -189,4 +238,4 @@ def run(device_name: str | None = None, quick: bool = False) -> list[Measurement
     device = shared_device(device_name)
     if quick:
         return [bench_relight(device, 2), bench_volume(device, 10), bench_decode(device, 3)]
-    return [bench_relight(device), bench_volume(device), bench_decode(device)]
+    return [bench_relight(device), bench_volume(device), bench_decode(device), *bench_features(device)]
