@@ -16,6 +16,7 @@ from gi_core.constants import SNOW_ALBEDO
 MAX_DIRECTIONAL_LIGHTS = 2
 # Sun visibility blends the four baked directions around the sun.
 PLANES_PER_LIGHT = 4
+VISIBILITY_CASES = 1 << PLANES_PER_LIGHT
 # Values of LocalLight.kind.
 LOCAL_POINT, LOCAL_SPOT, LOCAL_AREA = range(3)
 # Shadow rays to an area light, one to the middle of each quarter; points and spots take one.
@@ -56,12 +57,13 @@ SURFEL = Record(
 )
 DIRECTIONAL_LIGHT = Record(
     "DirectionalLight",
-    "Sun or moon. irradiance [lx] on a surface that faces it; visibility = sum of plane_weight over the planes whose bit is set.",
+    "Sun or moon. irradiance [lx] on a surface that faces it; visibility[bits] = sum of plane_weight over the planes whose bit is set.",
     (
         ("direction", "float", 4),
         ("irradiance", "float", 4),
         ("plane", "uint", PLANES_PER_LIGHT),
         ("plane_weight", "float", PLANES_PER_LIGHT),
+        ("visibility", "float", VISIBILITY_CASES),
     ),
 )
 VOLUME_BOX = Record(
@@ -112,6 +114,7 @@ RECORDS = (SURFEL, DIRECTIONAL_LIGHT, VOLUME_BOX, SURFEL_PLACE, LOCAL_LIGHT, SHA
 CONSTANTS: dict[str, int | float] = {
     "MAX_DIRECTIONAL_LIGHTS": MAX_DIRECTIONAL_LIGHTS,
     "PLANES_PER_LIGHT": PLANES_PER_LIGHT,
+    "VISIBILITY_CASES": VISIBILITY_CASES,
     "SNOW_ALBEDO": SNOW_ALBEDO,
     "LOCAL_POINT": LOCAL_POINT,
     "LOCAL_SPOT": LOCAL_SPOT,

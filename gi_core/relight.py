@@ -74,6 +74,8 @@ class ResidentSector:
         self.exitance = device.allocate((sector.brick_count + sky_patches) * 16)
         self.lights = device.allocate(MAX_DIRECTIONAL_LIGHTS * DIRECTIONAL_LIGHT.dtype.itemsize)
         self._fill: cl.Kernel | None = None
+        self.plane_bits = device.allocate(sector.surfel_count)
+        self._planes = b""
         self._given: RelightInput | None = None
         self._has_snow = bool(sector.surfel_snow.any())
         self._lamps: cl.Buffer | None = None
@@ -97,6 +99,7 @@ class ResidentSector:
             cl.enqueue_copy(self.device.queue, self.exitance, patches, dst_offset=self.sector.brick_count * 16)
             if len(given.lights):
                 cl.enqueue_copy(self.device.queue, self.lights, np.ascontiguousarray(given.lights))
+                self._select_planes(given)
             self._given = given
         variant = (len(given.lights), self._has_snow and given.snow > 0)
         if variant not in self._launches:
@@ -105,6 +108,17 @@ class ResidentSector:
         if variant[1] and self.sector.brick_count:
             launches[0].kernel.set_arg(launches[0].kernel.num_args - 1, np.float32(given.snow))
         return launches
+
+    def _select_planes(self, given: RelightInput) -> None:
+        planes = given.lights["plane"].tobytes()
+        surfels = self.sector.surfel_count
+        if planes == self._planes or surfels == 0:
+            return
+        kernel = self.device.kernel("select_planes", DIRECTIONAL_LIGHTS=len(given.lights))
+        words = np.uint32(self.sector.sun_visibility.shape[1])
+        kernel.set_args(np.uint32(surfels), self.sun_visibility, words, self.lights, self.plane_bits)
+        cl.enqueue_nd_range_kernel(self.device.queue, kernel, (surfels,), None)
+        self._planes = planes
 
     def set_lamps(self, surfel_light: cl.Buffer | None) -> None:
         """Irradiance [lx] that lamps give each surfel: (S, 4) float32 on the device, or None where there are none.
@@ -156,7 +170,7 @@ class ResidentSector:
         if self._lamps is not None:
             arguments.append(self._lamps)
         if light_count:
-            arguments += [self.sun_visibility, np.uint32(sector.sun_visibility.shape[1]), self.lights]
+            arguments += [self.plane_bits, self.lights]
         arguments.append(self.exitance)
         if snow:
             arguments.append(np.float32(0))  # launches() sets it

@@ -4,6 +4,7 @@
 
 #define MAX_DIRECTIONAL_LIGHTS 2
 #define PLANES_PER_LIGHT 4
+#define VISIBILITY_CASES 16
 #define SNOW_ALBEDO 0.85f
 #define LOCAL_POINT 0
 #define LOCAL_SPOT 1
@@ -21,12 +22,13 @@ typedef struct {
     float padding;
 } Surfel;
 
-// Sun or moon. irradiance [lx] on a surface that faces it; visibility = sum of plane_weight over the planes whose bit is set.
+// Sun or moon. irradiance [lx] on a surface that faces it; visibility[bits] = sum of plane_weight over the planes whose bit is set.
 typedef struct {
     float direction[4];
     float irradiance[4];
     uint plane[4];
     float plane_weight[4];
+    float visibility[16];
 } DirectionalLight;
 
 // Which of a sector's voxels go where in a volume: sizes and first indices along x, y, z.

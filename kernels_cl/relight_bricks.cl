@@ -52,8 +52,7 @@ __kernel void relight_bricks(
     __global const float4 *surfel_light,
 #endif
 #if DIRECTIONAL_LIGHTS > 0
-    __global const uint *sun_visibility,
-    const uint words,
+    __global const uchar *plane_bits,
     __constant const DirectionalLight *lights,
 #endif
     __global float4 *exitance
@@ -66,12 +65,6 @@ __kernel void relight_bricks(
     if (brick >= bricks)
         return;
     const uint first = brick_starts[brick], end = brick_starts[brick + 1];
-#if DIRECTIONAL_LIGHTS > 0
-    __global const uint *planes[DIRECTIONAL_LIGHTS * PLANES_PER_LIGHT];
-    __attribute__((opencl_unroll_hint(DIRECTIONAL_LIGHTS * PLANES_PER_LIGHT)))
-    for (int i = 0; i < DIRECTIONAL_LIGHTS * PLANES_PER_LIGHT; ++i)
-        planes[i] = sun_visibility + lights[i / PLANES_PER_LIGHT].plane[i % PLANES_PER_LIGHT] * words;
-#endif
     float4 sum = (float4)(0.0f);
     for (uint s = first; s < end; ++s) {
         __global const float4 *surfel = (__global const float4 *)(surfels + s);
@@ -85,7 +78,7 @@ __kernel void relight_bricks(
         __attribute__((opencl_unroll_hint(DIRECTIONAL_LIGHTS)))
         for (int i = 0; i < DIRECTIONAL_LIGHTS; ++i) {
             const float cosine = normal.x * lights[i].direction[0] + normal.y * lights[i].direction[1] + normal.z * lights[i].direction[2];
-            const float lit = fmax(cosine, 0.0f) * directional_visibility(planes + i * PLANES_PER_LIGHT, lights + i, s);
+            const float lit = fmax(cosine, 0.0f) * directional_visibility(lights + i, i, plane_bits[s]);
             irradiance += lit * vload4(0, lights[i].irradiance);
         }
 #endif

@@ -4,16 +4,11 @@
 
 #include "layout.h"
 
-// Share of a directional light that reaches a surfel: the baked directions around the light, blended.
-// A plane holds one bit per surfel. `plane` are the light's four planes.
-inline float directional_visibility(__global const uint *const *plane, __constant const DirectionalLight *light, uint surfel)
+// Share of light `index` that reaches a surfel: the baked directions around the light, blended. `plane_bits` is the surfel's byte as
+// select_planes.cl makes it; the light's table has the blend for each of the sixteen cases.
+inline float directional_visibility(__constant const DirectionalLight *light, int index, uchar plane_bits)
 {
-    const uint word = surfel >> 5, bit = surfel & 31;
-    float visibility = 0.0f;
-    __attribute__((opencl_unroll_hint(PLANES_PER_LIGHT)))
-    for (int i = 0; i < PLANES_PER_LIGHT; ++i)
-        visibility += light->plane_weight[i] * (float)((plane[i][word] >> bit) & 1);
-    return visibility;
+    return light->visibility[(plane_bits >> (index * PLANES_PER_LIGHT)) & (VISIBILITY_CASES - 1)];
 }
 
 #endif

@@ -10,7 +10,7 @@ from gi_core.device import Device, available_devices, choose_device, describe, s
 from gi_core.errors import DeviceError, KernelBuildError
 from gi_core.layout import DIRECTIONAL_LIGHT
 from gi_core.relight import Relighter, ResidentSector
-from gi_core.relight_input import RelightInput
+from gi_core.relight_input import RelightInput, visibility_cases
 from gi_core.volume import box_record, plan_boxes
 from kernels_cl import include_directory
 
@@ -34,6 +34,7 @@ def given_light(seed: int, lights: int, planes: int = 12, snow: float = 0.0) -> 
         record["plane"] = rng.integers(0, planes, 4)
         weight = rng.uniform(0, 1, 4)
         record["plane_weight"] = weight / weight.sum()
+        record["visibility"] = visibility_cases(record["plane_weight"])
     return RelightInput(rng.uniform(0, 2e4, (PATCHES, 3)).astype(np.float32), records, snow)
 
 
