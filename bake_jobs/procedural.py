@@ -161,7 +161,7 @@ def _street_lamps(block: Rectangle, name: str) -> list[Lamp]:
     middle = (kerb.z0 + kerb.z1) / 2
     places = [(kerb.x0 + (k + 0.5) * third, z) for z in (kerb.z0, kerb.z1) for k in range(3)] + [(kerb.x0, middle), (kerb.x1, middle)]
     return [
-        Lamp(f"{name} street lamp {number}", "point", (x, STREET_LAMP_HEIGHT_M, z), STREET_LAMP_LM, WARM)
+        Lamp(f"{name} street lamp {number}", "point", (x, STREET_LAMP_HEIGHT_M, z), STREET_LAMP_LM, WARM, schedule="night")
         for number, (x, z) in enumerate(places)
     ]
 

@@ -7,6 +7,7 @@ from typing import Any
 from gi_core.errors import SourceError
 
 Vector = tuple[float, float, float]
+_COUNT_WORDS = {2: "two", 3: "three"}
 
 
 class Table:
@@ -16,6 +17,9 @@ class Table:
         self.where = where
         self._values = values
         self._asked: list[str] = []
+
+    def __contains__(self, key: str) -> bool:
+        return key in self._values
 
     def take(self, key: str, default: Any) -> Any:
         """The value as TOML has it."""
@@ -47,10 +51,13 @@ class Table:
         value = self.take(key, default)
         if value is default and default is not None:
             return default
-        if not isinstance(value, list) or len(value) != 3 or not all(_is_number(one) and lowest <= one <= highest for one in value):
-            limits = "" if math.isinf(lowest) else f" from {lowest:g} to {highest:g}"
-            raise self._wrong(key, f"three numbers{limits}", value)
-        return float(value[0]), float(value[1]), float(value[2])
+        x, y, z = self._numbers(key, value, 3, lowest, highest)
+        return x, y, z
+
+    def pair(self, key: str, default: tuple[float, float], lowest: float, highest: float) -> tuple[float, float]:
+        """Two finite numbers."""
+        x, y = self._numbers(key, self.take(key, list(default)), 2, lowest, highest)
+        return x, y
 
     def table(self, key: str) -> "Table | None":
         value = self.take(key, {})
@@ -69,6 +76,12 @@ class Table:
         for key in self._values:
             if key not in self._asked:
                 raise SourceError(f"{self.where}: unknown key {key}; expected {', '.join(self._asked)}")
+
+    def _numbers(self, key: str, value: Any, count: int, lowest: float, highest: float) -> list[float]:
+        if not isinstance(value, list) or len(value) != count or not all(_is_number(one) and lowest <= one <= highest for one in value):
+            limits = "" if math.isinf(lowest) else f" from {lowest:g} to {highest:g}"
+            raise self._wrong(key, f"{_COUNT_WORDS[count]} numbers{limits}", value)
+        return [float(one) for one in value]
 
     def _wrong(self, key: str, expected: str, found: Any) -> SourceError:
         return SourceError(f"{self.where}: {key}: expected {expected}, found {found!r}")

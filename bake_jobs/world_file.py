@@ -22,11 +22,15 @@ maximum = [8.0, 4.0, 6.0]
 
 [[lamp]]
 name = "corner"
-kind = "point"                         # point, spot or area
-position = [3.0, 6.0, 2.0]
+kind = "point"                         # point, spot or area (a rectangle that shines to one side)
+position = [3.0, 6.0, 2.0]             # of an area its centre
 lumens = 8000.0
-color = [1.0, 0.8, 0.6]
-range_m = 30.0
+color = [1.0, 0.8, 0.6]                # linear sRGB, only ratios count; or temperature_k = 3000.0
+range_m = 30.0                         # light fades smoothly to none
+direction = [0.0, -1.0, 0.0]           # of a spot's axis, of an area's normal
+cone_degrees = 90.0                    # of a spot, full angle
+size = [1.0, 1.0]                      # of an area, width and height; the width is level
+schedule = "always"                    # or "night", or local times: "18:00-23:30"
 
 [[hint]]
 kind = "add"                           # add, or forbid
@@ -47,10 +51,22 @@ import numpy as np
 from bake_jobs.geography import MapFrame, timezone_at
 from bake_jobs.scene import Mesh, ProbeHint, SourceContent, join_meshes
 from bake_jobs.table import Table
-from gi_core.errors import SourceError
-from gi_core.world import Lamp, Location, Room
+from gi_core.errors import InputError, SourceError
+from gi_core.lights import (
+    MAX_CONE_DEGREES,
+    MAX_LUMENS,
+    MAX_RANGE_M,
+    MAX_SIZE_M,
+    MAX_TEMPERATURE_K,
+    MIN_CONE_DEGREES,
+    MIN_RANGE_M,
+    MIN_SIZE_M,
+    MIN_TEMPERATURE_K,
+    check_lamp,
+    color_from_temperature,
+)
+from gi_core.world import LAMP_KINDS, Lamp, Location, Room
 
-LAMP_KINDS = ("point", "spot", "area")
 HINT_KINDS = ("add", "forbid")
 MAX_ROOMS = 65_535  # a sector stores room numbers as uint16, and 0 is outdoors
 Loader = Callable[[Path, MapFrame | None], SourceContent]
@@ -126,15 +142,27 @@ def _room(table: Table) -> Room:
 
 
 def _lamp(table: Table) -> Lamp:
+    if "temperature_k" in table and "color" in table:
+        raise SourceError(f"{table.where}: expected color or temperature_k, found both")
+    temperature = table.number("temperature_k", 6500.0, MIN_TEMPERATURE_K, MAX_TEMPERATURE_K)
+    by_temperature = color_from_temperature(temperature) if "temperature_k" in table else None
     lamp = Lamp(
         table.text("name", None),
         table.choice("kind", LAMP_KINDS, "point"),
         table.vector("position", None),
-        table.number("lumens", None, 0.0, 1e12),
-        table.vector("color", Lamp.color, 0.0, 1e6),
-        table.number("range_m", Lamp.range_m, 0.01, 1e5),
+        table.number("lumens", None, 0.0, MAX_LUMENS),
+        by_temperature or table.vector("color", Lamp.color, 0.0, 1e6),
+        table.number("range_m", Lamp.range_m, MIN_RANGE_M, MAX_RANGE_M),
+        table.vector("direction", Lamp.direction),
+        table.number("cone_degrees", Lamp.cone_degrees, MIN_CONE_DEGREES, MAX_CONE_DEGREES),
+        table.pair("size", Lamp.size, MIN_SIZE_M, MAX_SIZE_M),
+        table.text("schedule", Lamp.schedule),
     )
     table.refuse_unknown()
+    try:
+        check_lamp(lamp)
+    except InputError as error:
+        raise SourceError(f"{table.where}: {error}") from error
     return lamp
 
 

@@ -20,9 +20,10 @@ from gi_core.errors import CorruptFileError, FormatVersionError, InputError, Sec
 from gi_core.geometry_file import Geometry
 from gi_core.grid import SectorIndex
 from gi_core.json_fields import Fields, all_finite
+from gi_core.lights import MAX_LUMENS, check_lamp
 from gi_core.sector import Sector
 from gi_core.sun_table import SunTable
-from gi_core.world import Lamp, Location, Room
+from gi_core.world import LAMP_KINDS, Lamp, Location, Room
 
 FORMAT = "sectorlight-dataset"
 VERSION = 1
@@ -215,14 +216,27 @@ def _room(room: Fields) -> Room:
 
 
 def _lamp(lamp: Fields) -> Lamp:
-    return Lamp(
+    size = lamp.sequence("size", 2)
+    if len(size) != 2:
+        raise CorruptFileError(f"{lamp.where}: size: expected two numbers, found {len(size)}; bake it again")
+    width, height = (Fields({"size": side}, lamp.where).number("size") for side in size)
+    found = Lamp(
         name=lamp.text("name"),
-        kind=lamp.text("kind"),
+        kind=lamp.choice("kind", LAMP_KINDS),
         position=lamp.point("position"),
-        lumens=lamp.number("lumens", 0, 1e12),
+        lumens=lamp.number("lumens", 0, MAX_LUMENS),
         color=lamp.point("color", 0),
         range_m=lamp.number("range_m", 0),
+        direction=lamp.point("direction"),
+        cone_degrees=lamp.number("cone_degrees"),
+        size=(width, height),
+        schedule=lamp.text("schedule"),
     )
+    try:
+        check_lamp(found)
+    except InputError as error:
+        raise CorruptFileError(f"{lamp.where}: {error}; bake it again") from error
+    return found
 
 
 def sector_path(root: Path, index: SectorIndex) -> Path:

@@ -38,13 +38,22 @@ class Room:
     maximum: tuple[float, float, float]
 
 
+LAMP_KINDS = ("point", "spot", "area")
+
+
 @dataclass(frozen=True)
 class Lamp:
     """A local light as authored. Carried in the dataset.
 
-    kind : "point", "spot" or "area"
-    position : (x, y, z) [m]; lumens : luminous flux [lm]; color : linear sRGB, luminance 1 when (1, 1, 1)
-    range_m : beyond this it gives nothing
+    kind : "point"; "spot", a cone about ``direction``; "area", a rectangle that shines to the side of ``direction``, its normal
+    position : (x, y, z) [m], of an area its centre
+    lumens : luminous flux [lm]
+    color : linear sRGB; only its ratios count, since the lumens say how much
+    range_m : light fades smoothly and beyond this, measured from ``position``, there is none
+    direction : (x, y, z), of any length but 0; a point ignores it
+    cone_degrees : full angle of a spot's cone, 1..180
+    size : width and height of an area [m]; the width is level, or along x when the normal is vertical
+    schedule : "always", "night" (the sun is below the horizon), or local times such as "18:00-23:30"
     """
 
     name: str
@@ -53,6 +62,10 @@ class Lamp:
     lumens: float
     color: tuple[float, float, float] = (1.0, 1.0, 1.0)
     range_m: float = 30.0
+    direction: tuple[float, float, float] = (0.0, -1.0, 0.0)
+    cone_degrees: float = 90.0
+    size: tuple[float, float] = (1.0, 1.0)
+    schedule: str = "always"
 
 
 def direction_from_azimuth(azimuth_degrees: float, elevation_degrees: float, north_degrees: float) -> Float64:

@@ -54,7 +54,11 @@ def tiny_scene() -> Scene:
         name="golden",
         location=Location(52.52, 13.405, 34.0, "Europe/Berlin", 10.0, date(2024, 3, 20), "given"),
         rooms=(Room("hall", (40.0, 0.0, 40.0), (50.0, 4.0, 50.0)),),
-        lamps=(Lamp("lamp", "point", (10.0, 5.0, 10.0), 8000.0, (1.0, 0.8, 0.6), 25.0),),
+        lamps=(
+            Lamp("lamp", "point", (10.0, 5.0, 10.0), 8000.0, (1.0, 0.8, 0.6), 25.0),
+            Lamp("shop", "area", (20.0, 2.0, 28.0), 3000.0, direction=(-1.0, 0.0, 0.0), size=(3.0, 1.5), schedule="07:30-21:00"),
+            Lamp("stage", "spot", (0.0, 6.0, 30.0), 5000.0, direction=(1.0, -1.0, 0.0), cone_degrees=40.0, schedule="night"),
+        ),
     )
 
 

@@ -1,0 +1,66 @@
+"""Which lamps touch a sector, and how many go into one launch: pure plans, no device."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gi_core.arrays import Float64
+from gi_core.lights import area_halves, check_lamp
+from gi_core.sector import Sector
+from gi_core.world import Lamp
+
+# Records of one launch lie in constant memory, and the shadow bits of its lamps in one buffer: 230 kB at talk size.
+MAX_LIGHTS_PER_LAUNCH = 32
+# 12 MB of them. A lamp that needs more has a launch of its own.
+MAX_TRIANGLES_PER_LAUNCH = 1 << 18
+# Shadow rays start a little off their surfel.
+_BOX_MARGIN_M = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class TouchingLamp:
+    """A lamp with a surfel in its range, and the box that all shadow rays between the two lie in.
+
+    low, high : (3,) float64 [m], world frame
+    """
+
+    lamp: Lamp
+    low: Float64
+    high: Float64
+
+
+def touching_lamps(lamps: Sequence[Lamp], sector: Sector) -> tuple[TouchingLamp, ...]:
+    """Lamps that have one of the sector's surfels in range, in their order: by the surfels' box first, then one by one.
+
+    Raises InputError for a touching lamp that cannot be lit with.
+    """
+    if not lamps or not sector.surfel_count:
+        return ()
+    surfels = sector.surfel_position.astype(np.float64)
+    position = np.array([lamp.position for lamp in lamps], np.float64) - sector.index.origin
+    squared_range = np.array([lamp.range_m for lamp in lamps], np.float64) ** 2
+    beyond = position - np.clip(position, surfels.min(axis=0), surfels.max(axis=0))
+    found = []
+    for i in np.flatnonzero((beyond**2).sum(axis=1) < squared_range).tolist():
+        near = surfels[((surfels - position[i]) ** 2).sum(axis=1) < squared_range[i]]
+        if len(near):
+            check_lamp(lamps[i])
+            extent = np.abs(area_halves(lamps[i])).sum(axis=0) if lamps[i].kind == "area" else np.zeros(3)
+            low = np.minimum(near.min(axis=0) - _BOX_MARGIN_M, position[i] - extent)
+            high = np.maximum(near.max(axis=0) + _BOX_MARGIN_M, position[i] + extent)
+            found.append(TouchingLamp(lamps[i], low + sector.index.origin, high + sector.index.origin))
+    return tuple(found)
+
+
+def plan_launches(triangle_counts: Sequence[int]) -> list[range]:
+    """Consecutive lamps for each launch, every lamp in one, from how many triangles each lamp has near it."""
+    launches, first, held = [], 0, 0
+    for i, count in enumerate(triangle_counts):
+        if i > first and (i - first == MAX_LIGHTS_PER_LAUNCH or held + count > MAX_TRIANGLES_PER_LAUNCH):
+            launches.append(range(first, i))
+            first, held = i, 0
+        held += count
+    if first < len(triangle_counts):
+        launches.append(range(first, len(triangle_counts)))
+    return launches
