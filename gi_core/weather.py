@@ -97,6 +97,12 @@ def weather_of(numbers: Mapping[str, float]) -> Weather:
     return parse_weather("clear:" + ",".join(f"{name}={float(value)!r}" for name, value in numbers.items()) if numbers else "clear")
 
 
+def between(first: float, second: float, share: float) -> float:
+    """The number a share 0..1 of the way from one to another; never beyond either, as rounding could put it."""
+    blend = (1 - share) * first + share * second
+    return min(max(blend, min(first, second)), max(first, second))
+
+
 def as_weather(weather: Weather | str) -> Weather:
     """A weather given as itself or as text."""
     return weather if isinstance(weather, Weather) else parse_weather(weather)

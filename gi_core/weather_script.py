@@ -19,7 +19,7 @@ import numpy as np
 
 from gi_core import snow_pack
 from gi_core.errors import InputError
-from gi_core.weather import WEATHER_RANGES, Weather, parse_weather, weather_of
+from gi_core.weather import WEATHER_RANGES, Weather, between, parse_weather, weather_of
 from gi_core.weather_chain import SHORTEST_SPELL_HOURS, Climate, SpellKind, WeatherChain, temperate_chain
 from gi_core.world import Location
 
@@ -107,7 +107,7 @@ class WeatherScript:
         share = min(max((hours - old.end_hours) / width + 0.5, 0.0), 1.0)
         share *= share * (3 - 2 * share)
         first, second = self._presets[old.preset], self._presets[new.preset]
-        return {name: (1 - share) * getattr(first, name) + share * getattr(second, name) for name in _BLENDED}
+        return {name: between(getattr(first, name), getattr(second, name), share) for name in _BLENDED}
 
     def _drawn(self, number: int) -> tuple[Spell, ...]:
         """The spells of a stretch."""
