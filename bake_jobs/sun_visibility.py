@@ -3,13 +3,12 @@
 import numpy as np
 
 from bake_jobs.rays import RayScene
+from bake_jobs.snow import snow_attribute
 from bake_jobs.surfels import Surfels
 from gi_core.arrays import Bool, Float32, Float64, UInt32
 
 # A surfel's position is the mean of its hits, which at an edge may lie a little below the surface.
 START_OFFSET_M = 0.05
-# Below this slope (cosine from the vertical) snow slides off; it lies fully on what is flatter than 45 degrees.
-SNOW_MIN_UP, SNOW_FULL_UP = 0.3, 0.7071
 
 
 def bake_visibility(ray_scene: RayScene, surfels: Surfels, origin: Float64, directions: Float64) -> UInt32:
@@ -35,12 +34,5 @@ def pack_bits(visible: Bool) -> UInt32:
 
 
 def bake_snow(ray_scene: RayScene, surfels: Surfels, origin: Float64) -> Float32:
-    """(S,) float32, 0..1: up-facing and open to the sky (slide "Procedural snow")."""
-    up = surfels.normal[:, 1]
-    lies = np.clip((up - SNOW_MIN_UP) / (SNOW_FULL_UP - SNOW_MIN_UP), 0, 1)
-    flat = np.flatnonzero(lies > 0)
-    start = surfels.position[flat] + origin + surfels.normal[flat] * START_OFFSET_M
-    open_sky = ~ray_scene.occluded(start, np.tile(np.array([[0, 1, 0]], np.float32), (len(flat), 1)))
-    snow = np.zeros(surfels.count, np.float32)
-    snow[flat] = lies[flat] * open_sky
-    return snow
+    """(S,) float32, 0..1: see ``snow_attribute``."""
+    return snow_attribute(ray_scene, surfels.position + origin + surfels.normal * START_OFFSET_M, surfels.normal)
