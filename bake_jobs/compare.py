@@ -33,7 +33,9 @@ from gi_core.engine import Engine
 from gi_core.errors import InputError
 from gi_core.grid import SectorIndex, voxel_centre
 from gi_core.lighting import Lighting
+from gi_core.lights import lamps_on
 from gi_core.volume import Volume, sample_volume
+from gi_core.world import Lamp
 
 # Beyond this, a building hides less of the sky than the reference's noise.
 GEOMETRY_REACH_M = 1024.0
@@ -44,20 +46,21 @@ Progress = Callable[[int, int, str], None]
 
 @dataclass(frozen=True)
 class Reference:
-    """The path tracer under one lighting. Every call draws its own seed, so that no two stages share their noise."""
+    """The path tracer under one lighting and its lamps. Every call draws its own seed, so that no two stages share their noise."""
 
     tracer: PathTracer
     lighting: Lighting
+    lamps: tuple[Lamp, ...]
     samples: int
     rng: np.random.Generator
 
     def cubes(self, points: Float64) -> Estimate:
         """(n, 3) [m] -> Estimate of (n, 6, 3) [lx]."""
-        return self.tracer.cube_irradiance(points, self.lighting, samples=self.samples, seed=self._seed())
+        return self.tracer.cube_irradiance(points, self.lighting, self.lamps, samples=self.samples, seed=self._seed())
 
     def surfaces(self, points: Float64, normals: Float64) -> Estimate:
         """(n, 3) [m] and unit normals -> Estimate of (n, 3) [lx]."""
-        return self.tracer.surface_irradiance(points, normals, self.lighting, samples=self.samples, seed=self._seed())
+        return self.tracer.surface_irradiance(points, normals, self.lighting, self.lamps, samples=self.samples, seed=self._seed())
 
     def _seed(self) -> int:
         return int(self.rng.integers(1 << 62))
@@ -115,7 +118,7 @@ def compare_dataset(
                 air["open"] += int(known.sum())
                 air["called_solid"] += int((known & (volume.mask < VOXEL_OUTDOORS)).sum())
             stages = found[state]
-            reference = Reference(tracer, lighting, samples, _rng(seed, index, lighting.digest))
+            reference = Reference(tracer, lighting, lamps_on(world.lamps, lighting), samples, _rng(seed, index, lighting.digest))
             stages["probes"].add(engine.lit_sector(index, lighting)[points.probe], reference.cubes(points.probe_position))
             _compare_voxels(stages["near"], volume, points.near, reference)
             _compare_voxels(stages["mid"], volume, points.mid, reference)

@@ -11,8 +11,11 @@ from gi_core.weather import parse_weather
 from gi_core.world import Location
 
 DEFAULT_STATES = ("noon", "low_sun", "overcast")
+NAMED_STATES = (*DEFAULT_STATES, "night", "snow")
 LOW_SUN_DEGREES = 5.0
-_ALLOWED = f"{', '.join(DEFAULT_STATES)}, or NAME=TIME/WEATHER such as dusk=20:45/partly_cloudy"
+NIGHT_DEGREES = -12.0  # the end of nautical twilight: what the sky still sends is less than any lamp
+_NIGHT_STEP = timedelta(minutes=10)
+_ALLOWED = f"{', '.join(NAMED_STATES)}, or NAME=TIME/WEATHER such as dusk=20:45/partly_cloudy"
 
 
 @dataclass(frozen=True)
@@ -27,7 +30,8 @@ class State:
 def parse_states(names: Sequence[str], location: Location) -> list[State]:
     """States by name, in order; a bare time means ``location.date``.
 
-    noon : clear, 12:00; low_sun : clear, the evening's moment with the sun 5 degrees up; overcast : overcast, 12:00.
+    noon : clear, 12:00; low_sun : clear, the evening's moment with the sun 5 degrees up; overcast : overcast, 12:00; night : clear, the
+    darkest moment (``night_time``); snow : snow, 12:00.
     Raises InputError for an unknown or repeated name, UnknownTimeError and UnknownWeatherError for what they do not know.
     """
     states = [_parse(text.strip(), location) for text in names]
@@ -41,16 +45,23 @@ def _parse(text: str, location: Location) -> State:
         return State(text, "12:00", "clear")
     if text == "overcast":
         return State(text, "12:00", "overcast")
+    if text == "snow":
+        return State(text, "12:00", "snow")
     if text == "low_sun":
-        return State(text, low_sun_time(location).replace(tzinfo=None).isoformat(timespec="seconds"), "clear")
+        return State(text, _text(low_sun_time(location)), "clear")
+    if text == "night":
+        return State(text, _text(night_time(location)), "clear")
     name, equals, moment = text.partition("=")
     time, slash, weather = moment.partition("/")
     if not (name and equals and slash):
         raise InputError(f"state {text[:60]!r}: expected {_ALLOWED}")
     parse_time(time, location)
-    if parse_weather(weather).snow > 0:
-        raise InputError(f"state {text[:60]!r}: the path tracer does not know snow-covered albedo; choose a weather without snow")
+    parse_weather(weather)
     return State(name, time, weather)
+
+
+def _text(moment: datetime) -> str:
+    return moment.replace(tzinfo=None).isoformat(timespec="seconds")
 
 
 def low_sun_time(location: Location) -> datetime:
@@ -73,3 +84,17 @@ def low_sun_time(location: Location) -> datetime:
         middle = (low + high) // 2
         high, low = (middle, low) if elevation_degrees(middle) > LOW_SUN_DEGREES else (high, middle)
     return local_time(noon + timedelta(seconds=low), location)
+
+
+def night_time(location: Location) -> datetime:
+    """The darkest moment, to ten minutes, of the first day from ``location.date`` on that has the sun below -12 degrees.
+
+    A high summer's nights are brighter than that: north of 54 degrees a June's ``night`` lies weeks later.
+    """
+    for day in range(366):
+        start = parse_time("00:00", location) + timedelta(days=day)
+        moments = [local_time(start + place * _NIGHT_STEP, location) for place in range(timedelta(days=1) // _NIGHT_STEP)]
+        heights = [sun_position(location, moment).elevation_degrees for moment in moments]
+        if min(heights) < NIGHT_DEGREES:
+            return moments[heights.index(min(heights))]
+    raise InputError(f"state 'night': the sun does not sink below {NIGHT_DEGREES:g} degrees within a year of {location.date}; name a time")

@@ -14,7 +14,7 @@ from gi_core.geometry_file import Geometry
 from gi_core.grid import SectorIndex, volume_first_voxel, voxel_centre
 from gi_core.lighting import DirectionalLight, Lighting
 from gi_core.volume import Volume
-from gi_core.world import Location
+from gi_core.world import Lamp, Location
 
 SKY, ALBEDO, GROUND_M = 1000.0, 0.3, 2.0
 PLAIN = {SectorIndex(x, z): SimpleNamespace(probes=4) for x in range(-9, 9) for z in range(-9, 9)}
@@ -31,10 +31,11 @@ class PlainDataset:
     """Sectors of bare ground, four probes each."""
 
     path = "plain"
+    lamps = ()
     wall_height_m = 0.0  # of a black wall along z through the middle of every sector
 
     def __init__(self, sectors=PLAIN):
-        self.world = SimpleNamespace(preset="talk", basis="cube", location=Location(), sectors=sectors, bake_id="ab")
+        self.world = SimpleNamespace(preset="talk", basis="cube", location=Location(), sectors=sectors, lamps=self.lamps, bake_id="ab")
 
     def geometry(self, index):
         corners = index.origin + 64 * np.array([[0, 0, 0], [0, 0, 1], [1, 0, 1], [1, 0, 0]]) + [0, GROUND_M, 0]
@@ -60,7 +61,7 @@ def plain_engine(factor=1.0, high_factor=1.0, no_sector_from=32, solid_from=32):
             sky = np.zeros((64, 128, 3), np.float32)
             sky[:32] = SKY
             dark = DirectionalLight(np.array([0.0, 1.0, 0.0]), np.zeros(3))
-            return Lighting(time, weather, dark, dark, sky, np.zeros((6, 3)), 0.0, 0.0, 0.0)
+            return Lighting("2024-06-21T12:00:00", weather, dark, dark, sky, np.zeros((6, 3)), 0.0, 0.0, 0.0)
 
         def lit_sector(self, index, lighting):
             return factor * np.repeat(plain_cube()[None], 4, axis=0)
@@ -149,6 +150,17 @@ def test_floor_follows_light_that_varies(run, monkeypatch):
     assert stages["shaded"]["nrmse"] > 0.3
 
 
+@pytest.mark.parametrize(("schedule", "is_missed"), [("always", True), ("night", False)])
+def test_lamps_shine_in_the_reference_while_they_are_on(run, monkeypatch, schedule, is_missed):
+    lamp = Lamp("lamp", "point", (32.0, 12.0, 32.0), 1e9, range_m=500.0, schedule=schedule)
+    monkeypatch.setattr(PlainDataset, "lamps", (lamp,))
+    stages = run(samples=256)["states"]["noon"]
+    for stage in ("probes", "near", "mid"):
+        assert (stages[stage]["bias"] < -0.5) == is_missed, stage
+    # An open plain's own bounce never comes back to it.
+    assert abs(stages["shaded"]["bias"]) < 2 * CLOSE
+
+
 def test_the_same_arguments_give_the_same_report(run):
     assert run(samples=64) == run(samples=64)
     assert run(samples=64) != run(samples=64, seed=1)
@@ -195,7 +207,7 @@ def test_no_probe_anywhere_is_refused():
         choose_sectors(PlainDataset({SectorIndex(0, 0): SimpleNamespace(probes=0)}), seed=0)
 
 
-@pytest.mark.parametrize(("options", "said"), [({"states": ["night"]}, "expected noon"), ({"points_per_sector": 0}, "at least 1 point")])
+@pytest.mark.parametrize(("options", "said"), [({"states": ["dawn"]}, "expected noon"), ({"points_per_sector": 0}, "at least 1 point")])
 def test_bad_requests_are_refused(run, options, said):
     with pytest.raises(InputError, match=said):
         run(**options)

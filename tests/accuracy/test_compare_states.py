@@ -5,7 +5,7 @@ from datetime import date
 
 import pytest
 
-from bake_jobs.compare_states import DEFAULT_STATES, State, low_sun_time, parse_states
+from bake_jobs.compare_states import DEFAULT_STATES, State, low_sun_time, night_time, parse_states
 from gi_core.clock_time import parse_time
 from gi_core.errors import InputError, UnknownTimeError, UnknownWeatherError
 from gi_core.sun import sun_position
@@ -40,6 +40,38 @@ def test_polar_day_and_night_have_no_low_sun(latitude):
         parse_states(["low_sun"], replace(Location(), latitude_degrees=latitude))
 
 
+@pytest.mark.parametrize(
+    "place",
+    [
+        Location(),
+        Location(latitude_degrees=-33.9, longitude_degrees=151.2, timezone="Australia/Sydney", date=date(2024, 12, 21)),
+        Location(latitude_degrees=48.1, longitude_degrees=11.6, timezone="Europe/Berlin", date=date(2024, 10, 27)),  # clocks change
+        Location(latitude_degrees=70.0, longitude_degrees=20.0, timezone="Europe/Oslo", date=date(2024, 12, 21)),  # no day at all
+    ],
+)
+def test_night_is_the_darkest_moment_of_the_date(place):
+    moment = night_time(place)
+    assert moment.date() == place.date
+    darkest = sun_position(place, moment).elevation_degrees
+    assert darkest < -12
+    hours = [sun_position(place, parse_time(f"{hour:02}:{minute:02}", place)).elevation_degrees for hour in range(24) for minute in (0, 30)]
+    assert darkest < min(hours) + 0.05  # within ten minutes of its lowest the sun moves by less
+
+
+@pytest.mark.parametrize("latitude", [60.0, 90.0])
+def test_after_white_nights_comes_a_dark_one(latitude):
+    place = replace(Location(), latitude_degrees=latitude)
+    moment = night_time(place)
+    assert sun_position(place, moment).elevation_degrees < -12
+    assert place.date < moment.date() < date(2024, 12, 21)
+
+
+def test_night_and_snow_by_name():
+    night, snow = parse_states(["night", "snow"], Location())
+    assert night == State("night", night_time(Location()).strftime("%Y-%m-%dT%H:%M:%S"), "clear")
+    assert snow == State("snow", "12:00", "snow")
+
+
 def test_own_states():
     assert parse_states(["dusk=20:45/partly_cloudy", " noon "], Location()) == [
         State("dusk", "20:45", "partly_cloudy"),
@@ -50,12 +82,11 @@ def test_own_states():
 @pytest.mark.parametrize(
     ("names", "error", "said"),
     [
-        (["night"], InputError, "expected noon, low_sun, overcast"),
+        (["dawn"], InputError, "expected noon, low_sun, overcast, night, snow"),
         ([], InputError, "at least one"),
         (["noon", "noon"], InputError, "distinct"),
         (["a=25:00/clear"], UnknownTimeError, "25:00"),
         (["a=12:00/plague"], UnknownWeatherError, "plague"),
-        (["a=12:00/snow"], InputError, "without snow"),
         (["a=12:00"], InputError, "NAME=TIME/WEATHER"),
     ],
 )
