@@ -7,7 +7,7 @@ import numpy as np
 
 from gi_core.arrays import Float64
 from gi_core.lights import area_halves, check_lamp
-from gi_core.sector import Sector
+from gi_core.sector import Sector, counts
 from gi_core.world import Lamp
 
 # Records of one launch lie in constant memory, and the shadow bits of its lamps in one buffer: 230 kB at talk size.
@@ -22,34 +22,54 @@ _BOX_MARGIN_M = 0.1
 class TouchingLamp:
     """A lamp with a surfel in its range, and the box that all shadow rays between the two lie in.
 
+    index : of the lamp in the list that it was given in
     low, high : (3,) float64 [m], world frame
     """
 
+    index: int
     lamp: Lamp
     low: Float64
     high: Float64
 
 
-def touching_lamps(lamps: Sequence[Lamp], sector: Sector) -> tuple[TouchingLamp, ...]:
-    """Lamps that have one of the sector's surfels in range, in their order: by the surfels' box first, then one by one.
+class SurfelBounds:
+    """Where a sector's surfels are, made once: finding what a lamp touches then looks at bricks first."""
+
+    def __init__(self, sector: Sector) -> None:
+        self.origin = sector.index.origin
+        self.position = sector.surfel_position.astype(np.float64)
+        self.per_brick = counts(sector.brick_starts)
+        first = sector.brick_starts[:-1].astype(np.int64)
+        empty = np.zeros((0, 3))
+        self.brick_low = np.minimum.reduceat(self.position, first) if len(first) else empty
+        self.brick_high = np.maximum.reduceat(self.position, first) if len(first) else empty
+
+    def within(self, position: Float64, distance_m: float) -> Float64:
+        """Sector-local positions (n, 3) [m] of the surfels closer than a distance to a sector-local position (3,)."""
+        beyond = position - np.clip(position, self.brick_low, self.brick_high)
+        near = self.position[np.repeat((beyond**2).sum(axis=1) < distance_m**2, self.per_brick)]
+        return np.asarray(near[((near - position) ** 2).sum(axis=1) < distance_m**2])
+
+
+def touching_lamps(lamps: Sequence[Lamp], surfels: SurfelBounds) -> tuple[TouchingLamp, ...]:
+    """Lamps that have one of the sector's surfels in range, in their order: by the surfels' box, then their bricks', then one by one.
 
     Raises InputError for a touching lamp that cannot be lit with.
     """
-    if not lamps or not sector.surfel_count:
+    if not lamps or not len(surfels.position):
         return ()
-    surfels = sector.surfel_position.astype(np.float64)
-    position = np.array([lamp.position for lamp in lamps], np.float64) - sector.index.origin
+    position = np.array([lamp.position for lamp in lamps], np.float64) - surfels.origin
     squared_range = np.array([lamp.range_m for lamp in lamps], np.float64) ** 2
-    beyond = position - np.clip(position, surfels.min(axis=0), surfels.max(axis=0))
+    beyond = position - np.clip(position, surfels.brick_low.min(axis=0), surfels.brick_high.max(axis=0))
     found = []
     for i in np.flatnonzero((beyond**2).sum(axis=1) < squared_range).tolist():
-        near = surfels[((surfels - position[i]) ** 2).sum(axis=1) < squared_range[i]]
+        near = surfels.within(position[i], lamps[i].range_m)
         if len(near):
             check_lamp(lamps[i])
             extent = np.abs(area_halves(lamps[i])).sum(axis=0) if lamps[i].kind == "area" else np.zeros(3)
             low = np.minimum(near.min(axis=0) - _BOX_MARGIN_M, position[i] - extent)
             high = np.maximum(near.max(axis=0) + _BOX_MARGIN_M, position[i] + extent)
-            found.append(TouchingLamp(lamps[i], low + sector.index.origin, high + sector.index.origin))
+            found.append(TouchingLamp(i, lamps[i], low + surfels.origin, high + surfels.origin))
     return tuple(found)
 
 

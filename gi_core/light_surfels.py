@@ -1,6 +1,7 @@
 """A sector's lamps on the device: what they give each surfel, shadowed, evaluated when a lamp changes and at no other time."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pyopencl as cl
@@ -9,8 +10,8 @@ from gi_core.arrays import AnyArray, Float64
 from gi_core.device import Device
 from gi_core.layout import SHADOW_TRIANGLE, SURFEL_PLACE
 from gi_core.light_geometry import ShadowGeometry
-from gi_core.light_plan import TouchingLamp, plan_launches, touching_lamps
-from gi_core.lights import light_records, reach_m, shadow_planes
+from gi_core.light_plan import SurfelBounds, TouchingLamp, plan_launches, touching_lamps
+from gi_core.lights import check_lamp, light_records, reach_m, shadow_planes
 from gi_core.sector import Sector
 from gi_core.world import Lamp
 
@@ -30,15 +31,17 @@ class SurfelLights:
         self._sector = sector
         self._shadows = shadows
         self._place: cl.Buffer | None = None
+        self._bounds: SurfelBounds | None = None
         self._static: cl.Buffer | None = None
         self._given_static: tuple[Lamp, ...] = ()
         self._given_dynamic: tuple[Lamp, ...] = ()
-        self._dynamic: tuple[TouchingLamp, ...] = ()
+        self._dynamic: list[_Traced] = []
 
     @property
     def nbytes(self) -> int:
         """Bytes on the device."""
-        return sum(int(held.size) for held in (self.buffer, self._place, self._static) if held is not None)
+        held = [self.buffer, self._place, self._static, *(traced.shadow_bits for traced in self._dynamic)]
+        return sum(int(buffer.size) for buffer in held if buffer is not None)
 
     def set_static(self, lamps: Sequence[Lamp]) -> None:
         """Lamps that seldom change: all of the world that are on, not only those near. Nothing happens when they are the same as before.
@@ -46,18 +49,22 @@ class SurfelLights:
         Raises InputError for a touching lamp that is out of its ranges, CorruptFileError for geometry that cannot be read.
         """
         if tuple(lamps) != self._given_static:
-            touching = touching_lamps(lamps, self._sector)
-            static = self._allocate() if touching else None
+            traced = self._trace(lamps)
+            static = self._allocate() if traced else None
             if static is not None:
-                self._add(touching, static)
+                self._add(traced, static)
             self._static = static
             self._given_static = tuple(lamps)
             self._sum()
 
     def set_dynamic(self, lamps: Sequence[Lamp]) -> None:
-        """Lamps that move or flicker, as ``set_static``."""
+        """Lamps that move or flicker, as ``set_static``. Those that only flicker keep their shadows."""
         if tuple(lamps) != self._given_dynamic:
-            self._dynamic = touching_lamps(lamps, self._sector)
+            standing = tuple(_as_it_stands(lamp) for lamp in lamps)
+            if standing == tuple(_as_it_stands(lamp) for lamp in self._given_dynamic):
+                self._dynamic = [traced.relit(lamps) for traced in self._dynamic]
+            else:
+                self._dynamic = self._trace(lamps)
             self._given_dynamic = tuple(lamps)
             self._sum()
 
@@ -76,37 +83,78 @@ class SurfelLights:
     def _allocate(self) -> cl.Buffer:
         return self._device.allocate(16 * self._sector.surfel_count)
 
-    def _add(self, touching: Sequence[TouchingLamp], target: cl.Buffer) -> None:
-        """Enqueue the addition of lamps to a sum, in their order."""
+    def _trace(self, lamps: Sequence[Lamp]) -> "list[_Traced]":
+        """Shadows of the lamps that touch, in their order."""
+        if not lamps:
+            return []
+        self._bounds = self._bounds or SurfelBounds(self._sector)
+        touching = touching_lamps(lamps, self._bounds)
         near = [shadow_triangles(self._shadows, lamp, self._sector.index.origin) for lamp in touching]
-        for launch in plan_launches([len(triangles) for triangles in near]):
-            self._launch([touching[i].lamp for i in launch], [near[i] for i in launch], target)
+        return [
+            self._trace_launch([touching[i] for i in launch], [near[i] for i in launch])
+            for launch in plan_launches([len(triangles) for triangles in near])
+        ]
 
-    def _launch(self, lamps: list[Lamp], triangles: list[AnyArray], target: cl.Buffer) -> None:
+    def _trace_launch(self, touching: list[TouchingLamp], triangles: list[AnyArray]) -> "_Traced":
         device, sector = self._device, self._sector
-        if self._place is None:
-            self._place = device.upload(surfel_places(sector))
-        surfels, words = np.uint32(sector.surfel_count), np.uint32((sector.surfel_count + 31) // 32)
-        planes = np.array([shadow_planes(lamp) for lamp in lamps])
-        plane_light = device.upload(np.repeat(np.arange(len(lamps), dtype=np.uint32), planes))
-        starts = device.upload(np.cumsum([0, *(len(t) for t in triangles)]).astype(np.uint32))
-        lights, between = device.upload(light_records(lamps, sector.index.origin)), device.upload(np.concatenate(triangles))
-        shadow_bits = device.allocate(4 * int(words) * int(planes.sum()))
-        trace, add = device.kernel("trace_shadows"), device.kernel("light_surfels")
-        trace(
-            device.queue,
-            (int(words), int(planes.sum())),
-            None,
-            surfels,
-            words,
-            self._place,
-            lights,
-            plane_light,
-            starts,
-            between,
+        lamps = tuple(found.lamp for found in touching)
+        words = (sector.surfel_count + 31) // 32
+        plane_counts = [shadow_planes(lamp) for lamp in lamps]
+        planes = sum(plane_counts)
+        shadow_bits = device.allocate(4 * words * planes)
+        arguments = [
+            np.uint32(sector.surfel_count),
+            np.uint32(words),
+            self._places(),
+            device.upload(light_records(lamps, sector.index.origin)),
+            device.upload(np.repeat(np.arange(len(lamps), dtype=np.uint32), plane_counts)),
+            device.upload(np.cumsum([0, *(len(t) for t in triangles)]).astype(np.uint32)),
+            device.upload(np.concatenate(triangles)),
             shadow_bits,
-        )
-        add(device.queue, (int(surfels),), None, surfels, words, self._place, lights, np.uint32(len(lamps)), shadow_bits, target)
+        ]
+        device.kernel("trace_shadows")(device.queue, (words, planes), None, *arguments)
+        return _Traced(lamps, tuple(found.index for found in touching), shadow_bits)
+
+    def _add(self, traced: "list[_Traced]", target: cl.Buffer) -> None:
+        """Enqueue the addition of lamps to a sum, in their order."""
+        device, sector = self._device, self._sector
+        for launch in traced:
+            arguments = [
+                np.uint32(sector.surfel_count),
+                np.uint32((sector.surfel_count + 31) // 32),
+                self._places(),
+                device.upload(light_records(launch.lamps, sector.index.origin)),
+                np.uint32(len(launch.lamps)),
+                launch.shadow_bits,
+                target,
+            ]
+            device.kernel("light_surfels")(device.queue, (sector.surfel_count,), None, *arguments)
+
+    def _places(self) -> cl.Buffer:
+        if self._place is None:
+            self._place = self._device.upload(surfel_places(self._sector))
+        return self._place
+
+
+@dataclass(frozen=True, eq=False)
+class _Traced:
+    """The lamps of one launch, where they stand in the list that they were given in, and their shadow bits."""
+
+    lamps: tuple[Lamp, ...]
+    indices: tuple[int, ...]
+    shadow_bits: cl.Buffer
+
+    def relit(self, lamps: Sequence[Lamp]) -> "_Traced":
+        """The same shadows with other lumens and colours, from a list of as many lamps. Raises InputError."""
+        chosen = tuple(lamps[i] for i in self.indices)
+        for lamp in chosen:
+            check_lamp(lamp)
+        return replace(self, lamps=chosen)
+
+
+def _as_it_stands(lamp: Lamp) -> Lamp:
+    """A lamp without what its shadows do not depend on."""
+    return replace(lamp, name="", lumens=0.0, color=(0.0, 0.0, 0.0), schedule="always")
 
 
 def surfel_places(sector: Sector) -> AnyArray:

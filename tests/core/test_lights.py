@@ -16,7 +16,7 @@ from gi_core.errors import CorruptFileError, InputError, SourceError
 from gi_core.geometry_file import Geometry
 from gi_core.grid import SectorIndex
 from gi_core.light_geometry import ShadowGeometry
-from gi_core.light_plan import MAX_LIGHTS_PER_LAUNCH, MAX_TRIANGLES_PER_LAUNCH, plan_launches, touching_lamps
+from gi_core.light_plan import MAX_LIGHTS_PER_LAUNCH, MAX_TRIANGLES_PER_LAUNCH, SurfelBounds, plan_launches, touching_lamps
 from gi_core.lighting_model import make_lighting
 from gi_core.lights import area_halves, check_lamp, color_from_temperature, is_on, lamps_digest, lamps_on, light_records
 from gi_core.spectrum import LUMINANCE_FROM_RGB
@@ -199,7 +199,7 @@ def test_lamps_touch_a_sector_by_its_surfels_and_not_by_its_borders(make_sector)
     rng = np.random.default_rng(3)
     lamps = [replace(LAMP, position=tuple(rng.uniform(-400, 400, 3)), range_m=float(rng.uniform(1, 150))) for _ in range(300)]
     expected = [lamp for lamp in lamps if (np.linalg.norm(surfels - lamp.position, axis=1) < lamp.range_m).any()]
-    touching = touching_lamps(lamps, sector)
+    touching = touching_lamps(lamps, SurfelBounds(sector))
     assert [t.lamp for t in touching] == expected
     assert 10 < len(expected) < 290
     for t in touching:

@@ -12,7 +12,7 @@ from gi_core.errors import InputError
 from gi_core.geometry_file import Geometry
 from gi_core.grid import SectorIndex
 from gi_core.light_geometry import ShadowGeometry
-from gi_core.light_plan import touching_lamps
+from gi_core.light_plan import SurfelBounds, touching_lamps
 from gi_core.light_surfels import SurfelLights, shadow_triangles, surfel_places
 from gi_core.lights import light_records
 from gi_core.spectrum import LUMINANCE_FROM_RGB
@@ -222,7 +222,7 @@ def test_the_kernels_equal_their_twins_on_random_sectors(device, make_sector, se
     sector = in_one_column(make_sector(seed, surfels=surfels), seed)
     shadows = geometry_of(rng.uniform(-30, 100, (triangles, 1, 3)) + rng.normal(size=(triangles, 3, 3)) * 12)
     given = random_lamps(rng, lamps)
-    touching = touching_lamps(given, sector)
+    touching = touching_lamps(given, SurfelBounds(sector))
     records = light_records([t.lamp for t in touching], sector.index.origin)
     near = [shadow_triangles(shadows, t, sector.index.origin) for t in touching]
     expected = lights_twin.light_surfels(records, surfel_places(sector), near)
@@ -243,7 +243,7 @@ def test_two_hundred_lamps_are_all_there(device, make_sector):
     together = light_of(device, sector, lamps)
     alone = np.sum([light_of(device, sector, [lamp]).astype(np.float64) for lamp in lamps], axis=0)
     np.testing.assert_allclose(together, alone, rtol=2e-5)  # 200 float32 additions
-    assert len(touching_lamps(lamps, sector)) > 150
+    assert len(touching_lamps(lamps, SurfelBounds(sector))) > 150
 
 
 def test_a_lamp_that_goes_off_gives_the_first_bytes_back(device, make_sector):
@@ -312,3 +312,28 @@ def test_far_from_the_worlds_origin_nothing_changes(device, make_sector):
     far = light_of(device, away, moved, geometry_of(triangles + away.index.origin, away.index))
     # A double 50 km from the origin is good to 7e-12 m; sector-local float32 to 4e-6 m here as there.
     np.testing.assert_allclose(far, near, rtol=1e-5, atol=1e-5 * near.max())
+
+
+def test_a_lamp_that_flickers_keeps_its_shadows_and_one_that_moves_does_not(device, make_sector):
+    rng = np.random.default_rng(17)
+    sector = in_one_column(make_sector(17, surfels=300), 17)
+    shadows = geometry_of(rng.uniform(0, 64, (30, 3, 3)))
+    lamps = random_lamps(rng, 40)
+    lit = SurfelLights(device, sector, shadows)
+    lit.set_dynamic(lamps)
+    held, bits = lit.nbytes, [traced.shadow_bits for traced in lit._dynamic]
+    assert len(bits) == 2
+    dimmed = [replace(lamp, lumens=lamp.lumens * 0.3, color=(0.2, 0.9, 0.4)) for lamp in lamps]
+    lit.set_dynamic(dimmed)
+    assert [traced.shadow_bits for traced in lit._dynamic] == bits
+    assert read(device, lit, sector).tobytes() == light_of(device, sector, dimmed, shadows).tobytes()
+    with pytest.raises(InputError, match="lumens"):
+        lit.set_dynamic([replace(lamp, lumens=-1.0) for lamp in lamps])
+    for others in (lamps[:-1], lamps[::-1], [replace(lamp, cone_degrees=20.0) for lamp in lamps]):
+        lit.set_dynamic(others)
+        assert read(device, lit, sector).tobytes() == light_of(device, sector, others, shadows).tobytes()
+    moved = [replace(lamp, position=(5.0, float(i), 9.0)) for i, lamp in enumerate(lamps)]
+    lit.set_dynamic(moved)
+    assert read(device, lit, sector).tobytes() == light_of(device, sector, moved, shadows).tobytes()
+    lit.set_dynamic(lamps)
+    assert lit.nbytes == held
