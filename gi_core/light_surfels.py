@@ -32,68 +32,68 @@ class SurfelLights:
         self._shadows = shadows
         self._place: cl.Buffer | None = None
         self._bounds: SurfelBounds | None = None
-        self._static: cl.Buffer | None = None
-        self._given_static: tuple[Lamp, ...] = ()
-        self._given_dynamic: tuple[Lamp, ...] = ()
-        self._dynamic: list[_Traced] = []
+        self._static = self._dynamic = _Lit()
+        self._static_sum: cl.Buffer | None = None
 
     @property
     def nbytes(self) -> int:
         """Bytes on the device."""
-        held = [self.buffer, self._place, self._static, *(traced.shadow_bits for traced in self._dynamic)]
+        held = [self.buffer, self._place, self._static_sum]
+        held += [traced.shadow_bits for lit in (self._static, self._dynamic) for traced in lit.traced]
         return sum(int(buffer.size) for buffer in held if buffer is not None)
 
     def set_static(self, lamps: Sequence[Lamp]) -> None:
-        """Lamps that seldom change: all of the world that are on, not only those near. Nothing happens when they are the same as before.
+        """Lamps that seldom change: all of the world that are on, not only those near. Nothing happens when they are the same as before,
+        and shadows stay when only lumens and colours have changed.
 
-        Raises InputError for a touching lamp that is out of its ranges, CorruptFileError for geometry that cannot be read.
+        Raises InputError for a touching lamp that is out of its ranges, CorruptFileError for geometry that cannot be read; then the
+        light stays as it was.
         """
-        if tuple(lamps) != self._given_static:
-            traced = self._trace(lamps)
-            static = self._allocate() if traced else None
-            if static is not None:
-                self._add(traced, static)
-            self._static = static
-            self._given_static = tuple(lamps)
+        if tuple(lamps) != self._static.given:
+            lit = self._changed(self._static, lamps)
+            total = self._allocate() if lit.traced else None
+            if total is not None:
+                self._add(lit, total)
+            self._static, self._static_sum = lit, total
             self._sum()
 
     def set_dynamic(self, lamps: Sequence[Lamp]) -> None:
-        """Lamps that move or flicker, as ``set_static``. Those that only flicker keep their shadows."""
-        if tuple(lamps) != self._given_dynamic:
-            standing = tuple(_as_it_stands(lamp) for lamp in lamps)
-            if standing == tuple(_as_it_stands(lamp) for lamp in self._given_dynamic):
-                self._dynamic = [traced.relit(lamps) for traced in self._dynamic]
-            else:
-                self._dynamic = self._trace(lamps)
-            self._given_dynamic = tuple(lamps)
+        """Lamps that move or flicker, as ``set_static``."""
+        if tuple(lamps) != self._dynamic.given:
+            self._dynamic = self._changed(self._dynamic, lamps)
             self._sum()
 
     def _sum(self) -> None:
-        if self._static is None and not self._dynamic:
+        if self._static_sum is None and not self._dynamic.traced:
             self.buffer = self._place = None
             return
         if self.buffer is None:
             self.buffer = self._allocate()
-        if self._static is not None:
-            cl.enqueue_copy(self._device.queue, self.buffer, self._static)
+        if self._static_sum is not None:
+            cl.enqueue_copy(self._device.queue, self.buffer, self._static_sum)
         else:
             cl.enqueue_fill_buffer(self._device.queue, self.buffer, np.uint8(0), 0, self.buffer.size)
         self._add(self._dynamic, self.buffer)
 
+    def _changed(self, before: "_Lit", lamps: Sequence[Lamp]) -> "_Lit":
+        """The lamps with their shadows: those of before when the lamps stand as they stood then."""
+        given = tuple(lamps)
+        if [_as_it_stands(lamp) for lamp in given] == [_as_it_stands(lamp) for lamp in before.given]:
+            return _Lit(given, tuple(traced.relit(given) for traced in before.traced))
+        return _Lit(given, self._trace(given))
+
     def _allocate(self) -> cl.Buffer:
         return self._device.allocate(16 * self._sector.surfel_count)
 
-    def _trace(self, lamps: Sequence[Lamp]) -> "list[_Traced]":
+    def _trace(self, lamps: Sequence[Lamp]) -> "tuple[_Traced, ...]":
         """Shadows of the lamps that touch, in their order."""
         if not lamps:
-            return []
+            return ()
         self._bounds = self._bounds or SurfelBounds(self._sector)
         touching = touching_lamps(lamps, self._bounds)
         near = [shadow_triangles(self._shadows, lamp, self._sector.index.origin) for lamp in touching]
-        return [
-            self._trace_launch([touching[i] for i in launch], [near[i] for i in launch])
-            for launch in plan_launches([len(triangles) for triangles in near])
-        ]
+        launches = plan_launches([len(triangles) for triangles in near])
+        return tuple(self._trace_launch([touching[i] for i in launch], [near[i] for i in launch]) for launch in launches)
 
     def _trace_launch(self, touching: list[TouchingLamp], triangles: list[AnyArray]) -> "_Traced":
         device, sector = self._device, self._sector
@@ -115,10 +115,10 @@ class SurfelLights:
         device.kernel("trace_shadows")(device.queue, (words, planes), None, *arguments)
         return _Traced(lamps, tuple(found.index for found in touching), shadow_bits)
 
-    def _add(self, traced: "list[_Traced]", target: cl.Buffer) -> None:
+    def _add(self, lit: "_Lit", target: cl.Buffer) -> None:
         """Enqueue the addition of lamps to a sum, in their order."""
         device, sector = self._device, self._sector
-        for launch in traced:
+        for launch in lit.traced:
             arguments = [
                 np.uint32(sector.surfel_count),
                 np.uint32((sector.surfel_count + 31) // 32),
@@ -150,6 +150,14 @@ class _Traced:
         for lamp in chosen:
             check_lamp(lamp)
         return replace(self, lamps=chosen)
+
+
+@dataclass(frozen=True, eq=False)
+class _Lit:
+    """A list of lamps as it was given, and what was traced for those of them that touch."""
+
+    given: tuple[Lamp, ...] = ()
+    traced: tuple[_Traced, ...] = ()
 
 
 def _as_it_stands(lamp: Lamp) -> Lamp:

@@ -5,7 +5,7 @@
     area    L = lumens / (pi width height)                       [cd m^-2], Lambertian, one-sided
 
 A spot's I0 is exact: smoothstep's mean over its edge is one half, so the cone's flux is the lumens. All three fade by the window
-(1 - (d / range)^4)^2 of Karis, "Real Shading in Unreal Engine 4", 2013: it takes 0.2 % at a fifth of the range, 2.5 % at a third,
+(1 - (d / range)^4)^2 of Karis, "Real Shading in Unreal Engine 4", 2013: it takes 0.3 % at a fifth of the range, 2.5 % at a third,
 12 % at a half, and all at the range itself. MATH.md has the rest.
 """
 

@@ -321,11 +321,11 @@ def test_a_lamp_that_flickers_keeps_its_shadows_and_one_that_moves_does_not(devi
     lamps = random_lamps(rng, 40)
     lit = SurfelLights(device, sector, shadows)
     lit.set_dynamic(lamps)
-    held, bits = lit.nbytes, [traced.shadow_bits for traced in lit._dynamic]
+    held, bits = lit.nbytes, [traced.shadow_bits for traced in lit._dynamic.traced]
     assert len(bits) == 2
     dimmed = [replace(lamp, lumens=lamp.lumens * 0.3, color=(0.2, 0.9, 0.4)) for lamp in lamps]
     lit.set_dynamic(dimmed)
-    assert [traced.shadow_bits for traced in lit._dynamic] == bits
+    assert [traced.shadow_bits for traced in lit._dynamic.traced] == bits
     assert read(device, lit, sector).tobytes() == light_of(device, sector, dimmed, shadows).tobytes()
     with pytest.raises(InputError, match="lumens"):
         lit.set_dynamic([replace(lamp, lumens=-1.0) for lamp in lamps])
@@ -337,3 +337,7 @@ def test_a_lamp_that_flickers_keeps_its_shadows_and_one_that_moves_does_not(devi
     assert read(device, lit, sector).tobytes() == light_of(device, sector, moved, shadows).tobytes()
     lit.set_dynamic(lamps)
     assert lit.nbytes == held
+    lit.set_dynamic([])
+    for brightened in (lamps, dimmed):
+        lit.set_static(brightened)
+        assert read(device, lit, sector).tobytes() == light_of(device, sector, brightened, shadows).tobytes()
