@@ -13,13 +13,17 @@ from gi_core.dataset import Dataset
 from gi_core.device import shared_device
 from gi_core.errors import FormatError, OutsideWorldError
 from gi_core.grid import SectorIndex, volume_first_voxel
+from gi_core.light_geometry import ShadowGeometry
+from gi_core.light_surfels import SurfelLights
 from gi_core.lighting import Lighting
 from gi_core.lighting_model import make_lighting
+from gi_core.lights import lamps_digest, lamps_on
 from gi_core.relight import Relighter, ResidentSector
 from gi_core.relight_input import relight_input, sky_face_exitance
 from gi_core.sector import PROBE_IN_MARGIN
 from gi_core.settings import NEUTRAL, Settings
 from gi_core.volume import SectorBox, Volume, box_mask, box_record, fill_missing_columns, plan_boxes
+from gi_core.world import Lamp
 
 # Device memory that queries may keep sectors in.
 RESIDENT_BYTES = 1 << 29
@@ -61,10 +65,14 @@ class Engine:
         """``device`` is part of an OpenCL device's description. Raises DeviceError."""
         self.dataset = dataset
         self.failed_sectors: dict[SectorIndex, str] = {}
+        self.lamps: tuple[Lamp, ...] = dataset.world.lamps
+        """Lamps of the world, each on by its schedule. Assign another tuple to move, add or remove some: nothing is baked again."""
         self._device = shared_device(device)
         self._relighter = Relighter(self._device)
         self._lock = threading.RLock()
         self._residents: OrderedDict[SectorIndex, ResidentSector] = OrderedDict()
+        self._shadows = ShadowGeometry(dataset.geometry, dataset.world.sectors)
+        self._lights: dict[SectorIndex, SurfelLights] = {}
         self._lit: OrderedDict[tuple[str, Settings, SectorIndex], Float32] = OrderedDict()
 
     @property
@@ -81,13 +89,15 @@ class Engine:
 
         Raises SectorMissingError, CorruptFileError.
         """
-        key = (lighting.digest, settings, index)
+        lamps = lamps_on(self.lamps, lighting)
+        key = (lighting.digest + lamps_digest(lamps), settings, index)
         with self._lock:
             if key in self._lit:
                 self._lit.move_to_end(key)
                 return self._lit[key]
             resident = self._resident(index)
             given = relight_input(settings.light(lighting), self.dataset.world.sun_table)
+            self._set_lamps(resident, settings.brightened(lamps))
             found = self._relighter.converge(resident, given)
             cubes = settings.cubes(found.first_bounce, found.cubes, resident.sector.probe_room)
             # Every later query gets this very array.
@@ -159,6 +169,14 @@ class Engine:
         mask[_slices(box)] = box_mask(box, sector)
         return sector.probe_count > 0
 
+    def _set_lamps(self, resident: ResidentSector, lamps: tuple[Lamp, ...]) -> None:
+        index = resident.sector.index
+        if index not in self._lights:
+            self._lights[index] = SurfelLights(self._device, resident.sector, self._shadows)
+        lights = self._lights[index]
+        lights.set_static(lamps)
+        resident.set_lamps(lights.buffer)
+
     def _resident(self, index: SectorIndex) -> ResidentSector:
         found = self._residents.get(index)
         if found is None:
@@ -170,7 +188,8 @@ class Engine:
             self.failed_sectors.pop(index, None)
             found = self._residents[index] = ResidentSector(self._device, sector, self.dataset.world.sky_patches)
             while len(self._residents) > 1 and sum(r.nbytes for r in self._residents.values()) > RESIDENT_BYTES:
-                self._residents.popitem(last=False)
+                evicted, _ = self._residents.popitem(last=False)
+                self._lights.pop(evicted, None)
         self._residents.move_to_end(index)
         return found
 

@@ -13,6 +13,7 @@ from gi_core.arrays import Float32, UInt16
 from gi_core.constants import ROOM_OUTDOORS
 from gi_core.errors import InputError
 from gi_core.lighting import DirectionalLight, Lighting
+from gi_core.world import Lamp
 
 # Beyond this a picture is white whatever the scene; float32 holds noon times this with room to spare.
 MAX_FACTOR = 100.0
@@ -69,6 +70,12 @@ class Settings:
         seen = np.pi * np.array([0.5, 0.5, 1.0, 0.0, 0.5, 0.5])[:, None]
         cube = lighting.sky_cube * self.sky_factor + seen * boost
         return replace(lighting, sun=dimmed(lighting.sun), moon=dimmed(lighting.moon), sky_radiance=sky, sky_cube=cube)
+
+    def brightened(self, lamps: tuple[Lamp, ...]) -> tuple[Lamp, ...]:
+        """Lamps with their gain applied; those that give nothing are left out."""
+        if self.lights_factor == 1.0:
+            return lamps
+        return tuple(replace(lamp, lumens=lamp.lumens * self.lights_factor) for lamp in lamps if self.lights_factor > 0)
 
     def cubes(self, first_bounce: Float32, converged: Float32, room: UInt16) -> Float32:
         """Probe cubes (P, 6, 3) [lx] from those with one bounce and with all, and each probe's room (P,)."""
