@@ -34,6 +34,7 @@ class SurfelLights:
         self._bounds: SurfelBounds | None = None
         self._static = self._dynamic = _Lit()
         self._static_sum: cl.Buffer | None = None
+        self._kernels: dict[str, cl.Kernel] = {}
 
     @property
     def nbytes(self) -> int:
@@ -101,7 +102,8 @@ class SurfelLights:
         words = (sector.surfel_count + 31) // 32
         plane_counts = [shadow_planes(lamp) for lamp in lamps]
         planes = sum(plane_counts)
-        shadow_bits = device.allocate(4 * words * planes)
+        # Every word is written: zeros would be a pass of their own.
+        shadow_bits = cl.Buffer(device.context, cl.mem_flags.READ_WRITE, 4 * words * planes)
         arguments = [
             np.uint32(sector.surfel_count),
             np.uint32(words),
@@ -112,7 +114,7 @@ class SurfelLights:
             device.upload(np.concatenate(triangles)),
             shadow_bits,
         ]
-        device.kernel("trace_shadows")(device.queue, (words, planes), None, *arguments)
+        self._kernel("trace_shadows")(device.queue, (words, planes), None, *arguments)
         return _Traced(lamps, tuple(found.index for found in touching), shadow_bits)
 
     def _add(self, lit: "_Lit", target: cl.Buffer) -> None:
@@ -128,7 +130,13 @@ class SurfelLights:
                 launch.shadow_bits,
                 target,
             ]
-            device.kernel("light_surfels")(device.queue, (sector.surfel_count,), None, *arguments)
+            self._kernel("light_surfels")(device.queue, (sector.surfel_count,), None, *arguments)
+
+    def _kernel(self, name: str) -> cl.Kernel:
+        # Making a kernel takes longer than running it.
+        if name not in self._kernels:
+            self._kernels[name] = self._device.kernel(name)
+        return self._kernels[name]
 
     def _places(self) -> cl.Buffer:
         if self._place is None:

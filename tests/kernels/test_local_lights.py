@@ -6,11 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bake_jobs.rays import RayScene
+from bake_jobs.solids import boxes
 from gi_core import lights_twin
 from gi_core.device import Device, available_devices, describe, shared_device
 from gi_core.errors import InputError
 from gi_core.geometry_file import Geometry
 from gi_core.grid import SectorIndex
+from gi_core.layout import SHADOW_END_M, SHADOW_START_M
 from gi_core.light_geometry import ShadowGeometry
 from gi_core.light_plan import SurfelBounds, touching_lamps
 from gi_core.light_surfels import SurfelLights, shadow_triangles, surfel_places
@@ -234,6 +237,27 @@ def test_the_kernels_equal_their_twins_on_random_sectors(device, make_sector, se
     assert expected.any()
     if triangles > 5:
         assert (light_of(device, sector, given) > 1.01 * found).any(), "no triangle stood in any lamp's way"
+
+
+def test_shadows_are_those_that_embree_traces(device, make_sector):
+    rng = np.random.default_rng(21)
+    low = rng.uniform(0, 56, (25, 3))
+    solids = [boxes(corner, corner + rng.uniform(2, 8, 3)) for corner in low]
+    triangles = np.concatenate([vertices[faces] for vertices, faces in solids])
+    rays = RayScene(triangles.reshape(-1, 3), np.arange(3 * len(triangles), dtype=np.int32).reshape(-1, 3))
+    sector = in_one_column(make_sector(21, surfels=2000), 21)
+    places = surfel_places(sector)
+    start = places["position"] + places["normal"] * np.float32(SHADOW_START_M)
+    shadows = geometry_of(triangles)
+    for lamp in [replace(lamp, kind="point", range_m=FAR) for lamp in random_lamps(rng, 6)]:
+        light, free = (light_of(device, sector, [lamp], between)[:, 1] for between in (shadows, NOTHING))
+        way = np.array(lamp.position) - start
+        distance = np.linalg.norm(way, axis=1)
+        unit = (way / distance[:, None]).astype(np.float32)
+        blocked = rays.occluded(start.astype(np.float64), unit, (distance - SHADOW_END_M).astype(np.float32))
+        # Two float32 roundings of a ray that grazes an edge differ: one in a thousand.
+        assert ((light == np.where(blocked, 0, free)) | (free == 0)).mean() > 0.999
+        assert 0.1 < blocked[free > 0].mean() < 0.95
 
 
 def test_two_hundred_lamps_are_all_there(device, make_sector):
