@@ -46,9 +46,9 @@ class SurfelBounds:
 
     def within(self, position: Float64, distance_m: float) -> Float64:
         """Sector-local positions (n, 3) [m] of the surfels closer than a distance to a sector-local position (3,)."""
-        beyond = position - np.clip(position, self.brick_low, self.brick_high)
-        near = self.position[np.repeat((beyond**2).sum(axis=1) < distance_m**2, self.per_brick)]
-        return np.asarray(near[((near - position) ** 2).sum(axis=1) < distance_m**2])
+        beyond = position - np.minimum(np.maximum(position, self.brick_low), self.brick_high)
+        near = self.position[np.repeat(_squares(beyond) < distance_m**2, self.per_brick)]
+        return np.asarray(near[_squares(near - position) < distance_m**2])
 
 
 def touching_lamps(lamps: Sequence[Lamp], surfels: SurfelBounds) -> tuple[TouchingLamp, ...]:
@@ -62,7 +62,7 @@ def touching_lamps(lamps: Sequence[Lamp], surfels: SurfelBounds) -> tuple[Touchi
     squared_range = np.array([lamp.range_m for lamp in lamps], np.float64) ** 2
     beyond = position - np.clip(position, surfels.brick_low.min(axis=0), surfels.brick_high.max(axis=0))
     found = []
-    for i in np.flatnonzero((beyond**2).sum(axis=1) < squared_range).tolist():
+    for i in np.flatnonzero(_squares(beyond) < squared_range).tolist():
         near = surfels.within(position[i], lamps[i].range_m)
         if len(near):
             check_lamp(lamps[i])
@@ -84,3 +84,8 @@ def plan_launches(triangle_counts: Sequence[int]) -> list[range]:
     if first < len(triangle_counts):
         launches.append(range(first, len(triangle_counts)))
     return launches
+
+
+def _squares(vectors: Float64) -> Float64:
+    """Squared lengths of (n, 3); some times faster than a sum over so short an axis."""
+    return np.asarray(np.einsum("ij,ij->i", vectors, vectors))

@@ -185,7 +185,7 @@ def shadow_triangles(shadows: ShadowGeometry, touching: TouchingLamp, origin: Fl
     corners = shadows.triangles_in(touching.low, touching.high)
     position = np.array(touching.lamp.position)
     beyond = position - np.clip(position, corners.min(axis=1), corners.max(axis=1))
-    corners = corners[(beyond**2).sum(axis=1) < reach_m(touching.lamp) ** 2] - origin
+    corners = corners[np.einsum("ij,ij->i", beyond, beyond) < reach_m(touching.lamp) ** 2] - origin
     records = np.zeros(len(corners), SHADOW_TRIANGLE.dtype)
     records["corner"] = corners[:, 0]
     records["edge_a"], records["edge_b"] = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
