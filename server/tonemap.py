@@ -13,6 +13,17 @@ WHITE_PER_EV = 1.2
 BRIGHTENING = 2.0
 
 
+# A reflected-light meter reads L = 12.5 / 100 * 2^EV100 (ISO 2720).
+METER_PER_EV = 0.125
+_LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
+
+
+def metered(radiance: Float32, ev100: float) -> float:
+    """EV100 for a picture (..., 3) [cd m^-2]: the sky's, unless lamps make the picture brighter than the sky would."""
+    luminance = np.maximum(radiance @ _LUMINANCE, np.float32(1e-6))
+    return max(ev100, float(np.log2(np.exp(np.log(luminance).mean()) / METER_PER_EV)))
+
+
 def exposed(radiance: Float32, ev100: float) -> Float32:
     """Radiance [cd m^-2] relative to white, one stop brighter than the meter's."""
     return np.asarray(radiance * np.float32(BRIGHTENING / (WHITE_PER_EV * 2.0**ev100)), np.float32)
@@ -31,8 +42,8 @@ def srgb_bytes(linear: Float32) -> UInt8:
 
 
 def png(radiance: Float32, ev100: float) -> bytes:
-    """A PNG of radiance (rows, columns, 3) [cd m^-2]."""
-    picture: AnyArray = srgb_bytes(filmic(exposed(radiance, ev100)))
+    """A PNG of radiance (rows, columns, 3) [cd m^-2]; ``ev100`` suits what the sky lights."""
+    picture: AnyArray = srgb_bytes(filmic(exposed(radiance, metered(radiance, ev100))))
     out = io.BytesIO()
     Image.fromarray(picture).save(out, "PNG", compress_level=6)
     return out.getvalue()

@@ -206,3 +206,11 @@ def test_a_png_keeps_rows_and_columns() -> None:
     assert pixels.shape == (9, 16, 3)
     assert pixels[0, -1, 0] == 255
     assert pixels.sum() == 255
+
+
+def test_the_meter_follows_lamps_but_never_opens_beyond_the_sky():
+    gray = np.full((4, 4, 3), 100.0, np.float32)
+    # 100 cd/m2 reads EV 9.64 on a meter with K = 12.5.
+    assert tonemap.metered(gray, 0.0) == pytest.approx(np.log2(800), abs=1e-3)
+    assert tonemap.metered(gray, 15.0) == 15.0
+    assert tonemap.metered(np.zeros((4, 4, 3), np.float32), -3.0) == -3.0
