@@ -18,7 +18,7 @@ $(VENV)/.ready: pyproject.toml
 	@touch $@
 
 $(VENV)/.judge: $(VENV)/.ready
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev,judge]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev,judge,sky]'
 	@touch $@
 
 demo: $(VENV)/.ready ## bake a small procedural city and serve it (Ctrl-C stops the server)
