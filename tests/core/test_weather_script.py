@@ -1,9 +1,11 @@
 """The weather script: a pure function of seed, place and moment, without a jump, in the shares and seasons of its chain."""
 
+import math
 import re
 from datetime import UTC, date, datetime, timedelta
 from zoneinfo import ZoneInfo
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -187,3 +189,16 @@ def test_a_location_moves_the_solar_day_only() -> None:
     east = WeatherScript(7, Location(longitude_degrees=NEW_YORK.longitude_degrees + 15, date=date(2020, 2, 29)))
     a, b = SCRIPT.at(START + timedelta(days=3, hours=1)), east.at(START + timedelta(days=3))
     assert all(getattr(a, name) == pytest.approx(getattr(b, name), abs=1e-9) for name in WEATHER_RANGES)
+
+
+@given(st.datetimes(datetime(1900, 1, 2), datetime(2100, 12, 30), timezones=st.just(UTC)), st.integers(0, 1000))
+@settings(max_examples=30, deadline=None)
+def test_the_light_of_a_script_does_not_jump_either(moment: datetime, seed: int) -> None:
+    script = WeatherScript(seed, NEW_YORK)
+    moments = (moment, moment + timedelta(seconds=1))
+    before, after = (make_lighting(NEW_YORK, at, script.at(at)) for at in moments)
+    # A second of blending moves light by 1 % at most, a second of twilight by 0.5 %: 0.02 stops.
+    assert after.exposure == pytest.approx(before.exposure, abs=0.03)
+    np.testing.assert_allclose(after.sky_cube, before.sky_cube, rtol=0.03)
+    assert before.sun.direction @ after.sun.direction > math.cos(math.radians(0.01))
+    assert abs(after.snow - before.snow) <= PER_SECOND
