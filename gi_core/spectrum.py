@@ -23,7 +23,7 @@ _RGB_FROM_XYZ = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415],
 
 # Ozone's Chappuis band at WAVELENGTH_NM [cm^-1 at standard conditions]. Leckner 1978.
 _OZONE_ABSORPTION = np.array([0.0, 0.002, 0.014, 0.048, 0.103, 0.125, 0.079, 0.036])
-_OZONE_COLUMN_CM = 0.3  # 300 Dobson units, the middle latitudes' mean
+_OZONE_COLUMN_CM = 0.34  # 340 Dobson units, the mean of 35 to 60 degrees; WMO Scientific Assessment of Ozone Depletion
 
 
 def _lobe(wavelength: Float64, centre: float, narrow: float, wide: float) -> Float64:
