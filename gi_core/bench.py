@@ -155,8 +155,8 @@ def bench_features(device: Device, rounds: int = 8) -> list[Measurement]:
         if lamps:
             for resident, buffer in zip(on, lit, strict=True):
                 resident.set_lamps(buffer)
-        added = sum(r.nbytes for r in on[:2]) - sum(r.nbytes for r in off[:2])
         times = side_by_side(_ticks(device, on, given), _ticks(device, off, without), 20 * rounds)
+        added = sum(r.nbytes for r in on[:2]) - sum(r.nbytes for r in off[:2])
         with_it, without_it = (1e3 * s for s in times)
         return Measurement(
             f"feature_{name}",

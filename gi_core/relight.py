@@ -64,7 +64,6 @@ class ResidentSector:
         weighted = sector.feedback_probe.shape[1] > 1 or not (sector.feedback_weight == 1).all()
         self.feedback_weight = device.upload(sector.feedback_weight) if weighted else None
         self.emission = None if sector.surfel_emission is None else device.upload(sector.surfel_emission)
-        self.sun_visibility = device.upload(sector.sun_visibility)
         self.factor_starts = device.upload(sector.factor_starts)
         self.factor_source = device.upload(sector.factor_source)
         self.factor_weight = device.upload(sector.factor_weight)
@@ -74,7 +73,9 @@ class ResidentSector:
         self.exitance = device.allocate((sector.brick_count + sky_patches) * 16)
         self.lights = device.allocate(MAX_DIRECTIONAL_LIGHTS * DIRECTIONAL_LIGHT.dtype.itemsize)
         self._fill: cl.Kernel | None = None
-        self.plane_bits = device.allocate(sector.surfel_count)
+        # Neither is there before the first sun or moon.
+        self.sun_visibility: cl.Buffer | None = None
+        self.plane_bits: cl.Buffer | None = None
         self._planes = b""
         self._given: RelightInput | None = None
         self._has_snow = bool(sector.surfel_snow.any())
@@ -114,6 +115,9 @@ class ResidentSector:
         surfels = self.sector.surfel_count
         if planes == self._planes or surfels == 0:
             return
+        if self.sun_visibility is None:
+            self.sun_visibility = self.device.upload(self.sector.sun_visibility)
+            self.plane_bits = self.device.allocate(surfels)
         kernel = self.device.kernel("select_planes", DIRECTIONAL_LIGHTS=len(given.lights))
         words = np.uint32(self.sector.sun_visibility.shape[1])
         kernel.set_args(np.uint32(surfels), self.sun_visibility, words, self.lights, self.plane_bits)
