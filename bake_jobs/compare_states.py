@@ -10,12 +10,11 @@ from gi_core.sun import sun_position
 from gi_core.weather import parse_weather
 from gi_core.world import Location
 
-DEFAULT_STATES = ("noon", "low_sun", "overcast")
-NAMED_STATES = (*DEFAULT_STATES, "night", "snow")
+DEFAULT_STATES = ("noon", "low_sun", "overcast", "night", "snow")
 LOW_SUN_DEGREES = 5.0
 NIGHT_DEGREES = -12.0  # the end of nautical twilight: what the sky still sends is less than any lamp
 _NIGHT_STEP = timedelta(minutes=10)
-_ALLOWED = f"{', '.join(NAMED_STATES)}, or NAME=TIME/WEATHER such as dusk=20:45/partly_cloudy"
+_ALLOWED = f"{', '.join(DEFAULT_STATES)}, or NAME=TIME/WEATHER such as dusk=20:45/partly_cloudy"
 
 
 @dataclass(frozen=True)

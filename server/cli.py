@@ -157,8 +157,8 @@ def serve(
 def compare(
     dataset: Annotated[Path, typer.Argument(help="A baked dataset's folder.")],
     states: Annotated[
-        str, typer.Option(help="Comma-separated: noon, low_sun, overcast, or NAME=TIME/WEATHER as in dusk=20:45/partly_cloudy.")
-    ] = "noon,low_sun,overcast",
+        str, typer.Option(help="Comma-separated: noon, low_sun, overcast, night, snow, or NAME=TIME/WEATHER as in dusk=20:45/fog.")
+    ] = "noon,low_sun,overcast,night,snow",
     sectors: Annotated[str, typer.Option(help="X0:X1,Z0:Z1 (half open), a number of sectors to draw at random, or all.")] = "9",
     points: Annotated[
         int, typer.Option(min=1, max=100_000, help="Points of each kind per sector; more: less chance in the figures.")

@@ -13,9 +13,11 @@ from gi_core.world import Location
 
 
 def test_default_states():
-    noon, low_sun, overcast = parse_states(DEFAULT_STATES, Location())
+    noon, low_sun, overcast, night, snow = parse_states(DEFAULT_STATES, Location())
     assert (noon.time, noon.weather) == ("12:00", "clear")
     assert (overcast.time, overcast.weather) == ("12:00", "overcast")
+    assert (snow.time, snow.weather) == ("12:00", "snow")
+    assert night == State("night", night_time(Location()).strftime("%Y-%m-%dT%H:%M:%S"), "clear")
     assert low_sun.weather == "clear"
     sun = sun_position(Location(), parse_time(low_sun.time, Location()))
     assert sun.elevation_degrees == pytest.approx(5, abs=0.004)  # the sun sinks by at most 0.0042 degrees a second
@@ -64,12 +66,6 @@ def test_after_white_nights_comes_a_dark_one(latitude):
     moment = night_time(place)
     assert sun_position(place, moment).elevation_degrees < -12
     assert place.date < moment.date() < date(2024, 12, 21)
-
-
-def test_night_and_snow_by_name():
-    night, snow = parse_states(["night", "snow"], Location())
-    assert night == State("night", night_time(Location()).strftime("%Y-%m-%dT%H:%M:%S"), "clear")
-    assert snow == State("snow", "12:00", "snow")
 
 
 def test_own_states():
