@@ -58,6 +58,16 @@ class LitProbes:
     sectors: tuple[SectorIndex, ...]
 
 
+@dataclass(frozen=True, eq=False)
+class _Light:
+    """One query's light. digest : of all in lighting and lamps that changes light."""
+
+    lighting: Lighting
+    lamps: tuple[Lamp, ...]
+    settings: Settings
+    digest: str
+
+
 class Engine:
     """Lights sectors of one dataset on one device. Safe to call from several threads; the device is used by one at a time."""
 
@@ -89,15 +99,22 @@ class Engine:
 
         Raises SectorMissingError, CorruptFileError.
         """
+        return self._lit_sector(index, self._light(lighting, settings))
+
+    def _light(self, lighting: Lighting, settings: Settings) -> _Light:
+        """What a query is lit by, worked out once for all its sectors."""
         lamps = lamps_on(self.lamps, lighting)
-        key = (lighting.digest + lamps_digest(lamps), settings, index)
+        return _Light(lighting, lamps, settings, lighting.digest + lamps_digest(lamps))
+
+    def _lit_sector(self, index: SectorIndex, light: _Light) -> Float32:
+        key = (light.digest, light.settings, index)
         with self._lock:
             if key in self._lit:
                 self._lit.move_to_end(key)
                 return self._lit[key]
-            resident = self._resident(index)
-            given = relight_input(settings.light(lighting), self.dataset.world.sun_table)
-            self._set_lamps(resident, settings.brightened(lamps))
+            resident, settings = self._resident(index), light.settings
+            given = relight_input(settings.light(light.lighting), self.dataset.world.sun_table)
+            self._set_lamps(resident, settings.brightened(light.lamps))
             found = self._relighter.converge(resident, given)
             cubes = settings.cubes(found.first_bounce, found.cubes, resident.sector.probe_room)
             # Every later query gets this very array.
@@ -116,9 +133,10 @@ class Engine:
             raise OutsideWorldError(self._outside(position))
         values = np.zeros((6, *VOLUME_SHAPE, 3), np.float32)
         mask = np.full(VOLUME_SHAPE, VOXEL_NO_SECTOR, np.uint8)
+        light = self._light(lighting, settings)
         with self._lock:
             target = self._device.allocate(values.nbytes)
-            unlit = [box for box in boxes if not self._fill(box, lighting, settings, target, mask)]
+            unlit = [box for box in boxes if not self._fill(box, light, target, mask)]
             self._device.read(target, values)
         lit_mask = mask.copy()
         for box in unlit:  # it has air, but no probe: lit like columns without a sector, by the nearest that are
@@ -145,9 +163,10 @@ class Engine:
         low, high = (np.floor((np.asarray(position)[[0, 2]] + sign * radius) / SECTOR_SIZE_M) for sign in (-1, 1))
         touched = [i for i in self.dataset.world.sectors if low[0] <= i.x <= high[0] and low[1] <= i.z <= high[1]]
         found = []
+        light = self._light(lighting, NEUTRAL)
         for index in sorted(touched, key=lambda i: (i.z, i.x)):
             with self._lock:
-                cubes = self.lit_sector(index, lighting)
+                cubes = self._lit_sector(index, light)
                 sector = self._resident(index).sector
             world = sector.probe_position + index.origin
             own = sector.probe_flags & PROBE_IN_MARGIN == 0
@@ -158,9 +177,9 @@ class Engine:
         position_, cubes_, room, flags = (np.concatenate([part[i] for part in found]) for i in range(4))
         return LitProbes(position_, cubes_, room, flags, tuple(s for part in found for s in part[4]))
 
-    def _fill(self, box: SectorBox, lighting: Lighting, settings: Settings, target: cl.Buffer, mask: UInt8) -> bool:
+    def _fill(self, box: SectorBox, light: _Light, target: cl.Buffer, mask: UInt8) -> bool:
         """Fill a sector's part of a volume and its mask; whether the sector has a probe, and so any light."""
-        cubes = self.lit_sector(box.index, lighting, settings)
+        cubes = self._lit_sector(box.index, light)
         resident = self._resident(box.index)
         sector = resident.sector
         resident.write_cubes(cubes)
@@ -197,7 +216,8 @@ class Engine:
         low, high = self.dataset.world.bounds
         if not np.isfinite(position).all() or not low[1] - HEIGHT_MARGIN_M <= position[1] <= high[1] + HEIGHT_MARGIN_M:
             raise OutsideWorldError(self._outside(position))
-        if (position[[0, 2]] < low[[0, 2]] - 64.0).any() or (position[[0, 2]] > high[[0, 2]] + 64.0).any():
+        beyond = np.maximum(low - position, position - high)[[0, 2]]
+        if (beyond > SECTOR_SIZE_M).any():
             raise OutsideWorldError(self._outside(position))
 
     def _outside(self, position: Float64) -> str:

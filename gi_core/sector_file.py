@@ -98,15 +98,6 @@ def quantised(sector: Sector, sky_patches: int) -> Sector:
     return decode(encode(sector, {}, sky_patches), f"sector {sector.index}")[0]
 
 
-def same_arrays(a: Sector, b: Sector) -> bool:
-    """Whether two sectors hold the same bytes."""
-    for field in fields(Sector):
-        x, y = getattr(a, field.name), getattr(b, field.name)
-        if isinstance(x, np.ndarray) != isinstance(y, np.ndarray) or (isinstance(x, np.ndarray) and not np.array_equal(x, y)):
-            return False
-    return a.index == b.index
-
-
 def _surfel_cells(brick_cell: AnyArray, brick_level: AnyArray, brick_starts: AnyArray) -> tuple[AnyArray, AnyArray]:
     """The cell (S, 3) of each surfel's brick, and its size (S, 1) [m]."""
     of_surfel = np.repeat(np.arange(len(brick_cell)), counts(brick_starts))

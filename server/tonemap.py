@@ -6,6 +6,7 @@ import numpy as np
 from PIL import Image
 
 from gi_core.arrays import AnyArray, Float32, UInt8
+from gi_core.spectrum import LUMINANCE_FROM_RGB
 
 # Saturation-based ISO speed (ISO 12232): the luminance that EV100 exposes to white is 1.2 x 2^EV100.
 WHITE_PER_EV = 1.2
@@ -15,12 +16,11 @@ BRIGHTENING = 2.0
 
 # A reflected-light meter reads L = 12.5 / 100 * 2^EV100 (ISO 2720).
 METER_PER_EV = 0.125
-_LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 
 def metered(radiance: Float32, ev100: float) -> float:
     """EV100 for a picture (..., 3) [cd m^-2]: the sky's, unless lamps make the picture brighter than the sky would."""
-    luminance = np.maximum(radiance @ _LUMINANCE, np.float32(1e-6))
+    luminance = np.maximum(radiance @ LUMINANCE_FROM_RGB.astype(np.float32), np.float32(1e-6))
     return max(ev100, float(np.log2(np.exp(np.log(luminance).mean()) / METER_PER_EV)))
 
 
