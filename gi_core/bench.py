@@ -16,8 +16,9 @@ from gi_core.constants import VOLUME_SHAPE
 from gi_core.device import Device, shared_device
 from gi_core.grid import SectorIndex
 from gi_core.layout import DIRECTIONAL_LIGHT
-from gi_core.relight import Relighter, ResidentSector
-from gi_core.relight_input import RelightInput, visibility_cases
+from gi_core.relight import Relighter
+from gi_core.relight_input import RelightInput
+from gi_core.resident_sector import ResidentSector
 from gi_core.sector import Sector, starts
 from gi_core.volume import box_record, plan_boxes
 
@@ -115,7 +116,6 @@ def daylight() -> RelightInput:
     sun["direction"][0, :3] = (0.4, 0.8, 0.447)
     sun["irradiance"][0, :3] = (1.1e5, 9.5e4, 7.5e4)
     sun["plane"], sun["plane_weight"] = (10, 11, 30, 31), (0.4, 0.3, 0.2, 0.1)
-    sun["visibility"] = visibility_cases(sun["plane_weight"][0])
     return RelightInput(np.full((SKY_PATCHES, 3), (1.2e4, 1.4e4, 1.8e4), np.float32), sun)
 
 

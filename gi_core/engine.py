@@ -18,8 +18,9 @@ from gi_core.light_surfels import SurfelLights
 from gi_core.lighting import Lighting
 from gi_core.lighting_model import make_lighting
 from gi_core.lights import lamps_digest, lamps_on
-from gi_core.relight import Relighter, ResidentSector
+from gi_core.relight import Relighter
 from gi_core.relight_input import relight_input, sky_face_exitance
+from gi_core.resident_sector import ResidentSector
 from gi_core.sector import PROBE_IN_MARGIN
 from gi_core.settings import NEUTRAL, Settings
 from gi_core.volume import SectorBox, Volume, box_mask, box_record, fill_missing_columns, plan_boxes

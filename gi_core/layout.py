@@ -16,7 +16,11 @@ from gi_core.constants import SNOW_ALBEDO
 MAX_DIRECTIONAL_LIGHTS = 2
 # Sun visibility blends the four baked directions around the sun.
 PLANES_PER_LIGHT = 4
-VISIBILITY_CASES = 1 << PLANES_PER_LIGHT
+# A bounce keeps its row in the fraction bits of a float between 1 and 2: as a whole number its bits would be a denormal float, which
+# some processors multiply a hundred times as slowly, and the row shares a vector with colours.
+ROW_BITS, ROW_ONE = 0x7FFFFF, 0x3F800000
+# A surfel's sample of the sun's shadow map is a share of this; NO_SAMPLE stands for none.
+WHOLE_SAMPLE, NO_SAMPLE = 254, 255
 # Values of LocalLight.kind.
 LOCAL_POINT, LOCAL_SPOT, LOCAL_AREA = range(3)
 # Shadow rays to an area light, one to the middle of each quarter; points and spots take one.
@@ -27,6 +31,9 @@ LAMP_RADIUS_M = 0.05
 SHADOW_START_M = 0.05
 # and end this far before the lamp, so that a lamp on a ceiling or a wall is not hidden by it.
 SHADOW_END_M = 0.02
+# A surfel is looked up this far in front of its plane, in metres and in shares of its cell: its position is a mean of hits, which
+# where the surface bends lies below some of it.
+SHADOW_BIAS_M, SHADOW_BIAS_CELLS = 0.05, 0.05
 
 _SCALARS = {"float": "f4", "uint": "u4", "int": "i4"}
 
@@ -50,20 +57,19 @@ class Record:
         )
 
 
-SURFEL = Record(
-    "Surfel",
-    "What relighting needs of a surfel; feedback probes and sun bits are arrays of their own.",
-    (("normal", "float", 3), ("snow", "float", 1), ("albedo", "float", 3), ("padding", "float", 1)),
+BOUNCE = Record(
+    "Bounce",
+    "How much of one row of the probes' cubes a brick sends on, per channel. row : ROW_ONE + probe * 6 + face.",
+    (("albedo", "float", 3), ("row", "uint", 1)),
 )
 DIRECTIONAL_LIGHT = Record(
     "DirectionalLight",
-    "Sun or moon. irradiance [lx] on a surface that faces it; visibility[bits] = sum of plane_weight over the planes whose bit is set.",
+    "Sun or moon. irradiance [lx] on a surface that faces it; plane, plane_weight: the baked directions around it, and how to blend them.",
     (
         ("direction", "float", 4),
         ("irradiance", "float", 4),
         ("plane", "uint", PLANES_PER_LIGHT),
         ("plane_weight", "float", PLANES_PER_LIGHT),
-        ("visibility", "float", VISIBILITY_CASES),
     ),
 )
 VOLUME_BOX = Record(
@@ -110,12 +116,29 @@ SHADOW_TRIANGLE = Record(
         ("padding_c", "float", 1),
     ),
 )
-RECORDS = (SURFEL, DIRECTIONAL_LIGHT, VOLUME_BOX, SURFEL_PLACE, LOCAL_LIGHT, SHADOW_TRIANGLE)
+SHADOW_FRAME = Record(
+    "ShadowFrame",
+    "A shadow map's axes, unit, world frame; size [texels] along each side; origin: a sector's, relative to the middle of the map [m].",
+    (
+        ("across", "float", 3),
+        ("texels_per_metre", "float", 1),
+        ("down", "float", 3),
+        ("size", "float", 1),
+        ("to_sun", "float", 3),
+        ("padding_a", "float", 1),
+        ("origin", "float", 3),
+        ("padding_b", "float", 1),
+    ),
+)
+RECORDS = (BOUNCE, DIRECTIONAL_LIGHT, VOLUME_BOX, SURFEL_PLACE, LOCAL_LIGHT, SHADOW_TRIANGLE, SHADOW_FRAME)
 CONSTANTS: dict[str, int | float] = {
     "MAX_DIRECTIONAL_LIGHTS": MAX_DIRECTIONAL_LIGHTS,
     "PLANES_PER_LIGHT": PLANES_PER_LIGHT,
-    "VISIBILITY_CASES": VISIBILITY_CASES,
     "SNOW_ALBEDO": SNOW_ALBEDO,
+    "ROW_BITS": ROW_BITS,
+    "ROW_ONE": ROW_ONE,
+    "WHOLE_SAMPLE": WHOLE_SAMPLE,
+    "NO_SAMPLE": NO_SAMPLE,
     "LOCAL_POINT": LOCAL_POINT,
     "LOCAL_SPOT": LOCAL_SPOT,
     "LOCAL_AREA": LOCAL_AREA,
@@ -123,6 +146,8 @@ CONSTANTS: dict[str, int | float] = {
     "LAMP_RADIUS_M": LAMP_RADIUS_M,
     "SHADOW_START_M": SHADOW_START_M,
     "SHADOW_END_M": SHADOW_END_M,
+    "SHADOW_BIAS_M": SHADOW_BIAS_M,
+    "SHADOW_BIAS_CELLS": SHADOW_BIAS_CELLS,
 }
 
 

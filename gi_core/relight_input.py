@@ -6,7 +6,7 @@ import numpy as np
 
 from gi_core.ambient_cube import FACE_DIRECTIONS
 from gi_core.arrays import AnyArray, Float32
-from gi_core.layout import DIRECTIONAL_LIGHT, PLANES_PER_LIGHT, VISIBILITY_CASES
+from gi_core.layout import DIRECTIONAL_LIGHT
 from gi_core.lighting import Lighting
 from gi_core.sun_table import SunTable
 
@@ -36,15 +36,6 @@ def sky_face_exitance(lighting: Lighting) -> Float32:
     return np.where(share > 0, lighting.sky_cube / np.maximum(share, 1e-9), 0).astype(np.float32)
 
 
-def visibility_cases(plane_weight: Float32) -> Float32:
-    """(16,) float32: visibility for every set of planes that a surfel may see, bit i of the index being plane i. Weights (4,)."""
-    visible = np.arange(VISIBILITY_CASES)[:, None] >> np.arange(PLANES_PER_LIGHT) & 1
-    total = np.zeros(VISIBILITY_CASES, np.float32)
-    for i in range(PLANES_PER_LIGHT):  # in the twin's order, so that the sums round alike
-        total += np.float32(plane_weight[i]) * visible[:, i].astype(np.float32)
-    return total
-
-
 def relight_input(lighting: Lighting, table: SunTable) -> RelightInput:
     """Project a lighting snapshot to what the relighter takes, for a dataset with this sun table."""
     shining = lighting.directional_lights
@@ -54,5 +45,4 @@ def relight_input(lighting: Lighting, table: SunTable) -> RelightInput:
         record["direction"][:3] = light.direction
         record["irradiance"][:3] = light.irradiance
         record["plane"], record["plane_weight"] = planes, weights
-        record["visibility"] = visibility_cases(weights)
     return RelightInput(sky_face_exitance(lighting), lights, lighting.snow)

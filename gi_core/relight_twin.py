@@ -1,4 +1,5 @@
-"""The relighter in NumPy, written to be read and to be trusted: twin of relight_bricks.cl, gather_probes.cl and fill_volume.cl.
+"""The relighter in NumPy, written to be read and to be trusted: twin of light_bricks.cl, bounce_bricks.cl,
+gather_probes.cl and fill_volume.cl.
 
 With dtype float64 it is also the solver that the kernels are judged by.
 """
@@ -39,20 +40,32 @@ def snowed_albedo(sector: Sector, snow: float, dtype: Any = np.float32) -> AnyAr
     return albedo + (dtype(SNOW_ALBEDO) - albedo) * cover
 
 
-def relight_bricks(sector: Sector, given: RelightInput, cubes: AnyArray, direct: AnyArray, dtype: Any = np.float32) -> AnyArray:
-    """Exitance (N + patches, 3) [lx] of bricks and sky patches, from last pass's cubes (P, 6, 3) and ``directional_irradiance``."""
-    irradiance = direct.copy()
+def brick_means(sector: Sector, exitance: AnyArray) -> AnyArray:
+    """(N, 3): the mean over each brick's surfels of (S, 3)."""
+    if not sector.brick_count:
+        return exitance[:0]
+    sums = np.add.reduceat(exitance, sector.brick_starts[:-1].astype(np.int64), axis=0)
+    return np.asarray(sums / counts(sector.brick_starts)[:, None].astype(exitance.dtype))
+
+
+def light_bricks(sector: Sector, given: RelightInput, lamps: AnyArray | None = None, dtype: Any = np.float32) -> AnyArray:
+    """(N, 3) [lx]: what bricks send out of the light of sun, moon, lamps (S, 3) [lx] and their own emission, before any bounce."""
+    irradiance = directional_irradiance(sector, given, dtype) + (0 if lamps is None else lamps.astype(dtype))
+    exitance = snowed_albedo(sector, given.snow, dtype) * irradiance
+    if sector.surfel_emission is not None:
+        exitance += dtype(np.pi) * sector.surfel_emission.astype(dtype)
+    return brick_means(sector, exitance)
+
+
+def bounce_bricks(sector: Sector, given: RelightInput, cubes: AnyArray, dtype: Any = np.float32) -> AnyArray:
+    """(N, 3) [lx]: what bricks send on of last pass's cubes (P, 6, 3), surfel by surfel. Its kernel sums by brick and probe beforehand."""
+    irradiance = np.zeros((sector.surfel_count, 3), dtype)
     if sector.probe_count:
         face_weight = basis_weights(sector.surfel_normal).astype(dtype)
         for k in range(sector.feedback_probe.shape[1]):
             bounced = np.einsum("sb,sbc->sc", face_weight, cubes[sector.feedback_probe[:, k]])
             irradiance += sector.feedback_weight[:, k, None].astype(dtype) * bounced
-    exitance = snowed_albedo(sector, given.snow, dtype) * irradiance
-    if sector.surfel_emission is not None:
-        exitance += dtype(np.pi) * sector.surfel_emission.astype(dtype)
-    bricks = np.add.reduceat(exitance, sector.brick_starts[:-1].astype(np.int64), axis=0) if sector.brick_count else exitance[:0]
-    bricks /= counts(sector.brick_starts)[:, None].astype(dtype)
-    return np.concatenate([bricks, given.patch_exitance.astype(dtype)])
+    return brick_means(sector, snowed_albedo(sector, given.snow, dtype) * irradiance)
 
 
 def gather_probes(sector: Sector, exitance: AnyArray, dtype: Any = np.float32) -> AnyArray:
@@ -69,9 +82,11 @@ def relight(
     sector: Sector, given: RelightInput, cubes: AnyArray, passes: int, dtype: Any = np.float32, lamps: AnyArray | None = None
 ) -> AnyArray:
     """Cubes (P, B, 3) [lx] after some passes, starting from others; each pass adds a bounce. lamps : (S, 3) [lx] on each surfel."""
-    direct = directional_irradiance(sector, given, dtype) + (0 if lamps is None else lamps.astype(dtype))
+    direct = light_bricks(sector, given, lamps, dtype)
+    patches = given.patch_exitance.astype(dtype)
     for _ in range(passes):
-        cubes = gather_probes(sector, relight_bricks(sector, given, cubes, direct, dtype), dtype)
+        exitance = np.concatenate([direct + bounce_bricks(sector, given, cubes, dtype), patches])
+        cubes = gather_probes(sector, exitance, dtype)
     return cubes
 
 
@@ -80,9 +95,10 @@ def solve(
 ) -> Float64:
     """The fixed point (P, B, 3) [lx] in float64: passes until none changes any value by more than tolerance times the peak."""
     cubes = np.zeros((sector.probe_count, sector.basis_size, 3))
-    direct = directional_irradiance(sector, given, np.float64) + (0 if lamps is None else lamps.astype(np.float64))
+    direct = light_bricks(sector, given, lamps, np.float64)
     for _ in range(max_passes):
-        after = gather_probes(sector, relight_bricks(sector, given, cubes, direct, np.float64), np.float64)
+        bounced = bounce_bricks(sector, given, cubes, np.float64)
+        after = gather_probes(sector, np.concatenate([direct + bounced, given.patch_exitance.astype(np.float64)]), np.float64)
         change, cubes = np.abs(after - cubes).max(initial=0), after
         if change <= tolerance * np.abs(cubes).max(initial=0):
             break

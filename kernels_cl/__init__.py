@@ -10,5 +10,5 @@ def include_directory() -> Path:
 
 
 def source(name: str) -> str:
-    """Text of one kernel file, for example ``relight_bricks.cl``."""
+    """Text of one kernel file, for example ``gather_probes.cl``."""
     return (include_directory() / name).read_text(encoding="utf-8")

@@ -4,8 +4,11 @@
 
 #define MAX_DIRECTIONAL_LIGHTS 2
 #define PLANES_PER_LIGHT 4
-#define VISIBILITY_CASES 16
 #define SNOW_ALBEDO 0.85f
+#define ROW_BITS 8388607
+#define ROW_ONE 1065353216
+#define WHOLE_SAMPLE 254
+#define NO_SAMPLE 255
 #define LOCAL_POINT 0
 #define LOCAL_SPOT 1
 #define LOCAL_AREA 2
@@ -13,22 +16,21 @@
 #define LAMP_RADIUS_M 0.05f
 #define SHADOW_START_M 0.05f
 #define SHADOW_END_M 0.02f
+#define SHADOW_BIAS_M 0.05f
+#define SHADOW_BIAS_CELLS 0.05f
 
-// What relighting needs of a surfel; feedback probes and sun bits are arrays of their own.
+// How much of one row of the probes' cubes a brick sends on, per channel. row : ROW_ONE + probe * 6 + face.
 typedef struct {
-    float normal[3];
-    float snow;
     float albedo[3];
-    float padding;
-} Surfel;
+    uint row;
+} Bounce;
 
-// Sun or moon. irradiance [lx] on a surface that faces it; visibility[bits] = sum of plane_weight over the planes whose bit is set.
+// Sun or moon. irradiance [lx] on a surface that faces it; plane, plane_weight: the baked directions around it, and how to blend them.
 typedef struct {
     float direction[4];
     float irradiance[4];
     uint plane[4];
     float plane_weight[4];
-    float visibility[16];
 } DirectionalLight;
 
 // Which of a sector's voxels go where in a volume: sizes and first indices along x, y, z.
@@ -71,5 +73,17 @@ typedef struct {
     float edge_b[3];
     float padding_c;
 } ShadowTriangle;
+
+// A shadow map's axes, unit, world frame; size [texels] along each side; origin: a sector's, relative to the middle of the map [m].
+typedef struct {
+    float across[3];
+    float texels_per_metre;
+    float down[3];
+    float size;
+    float to_sun[3];
+    float padding_a;
+    float origin[3];
+    float padding_b;
+} ShadowFrame;
 
 #endif

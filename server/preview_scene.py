@@ -5,10 +5,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from gi_core.dataset import Dataset
 
 from gi_core.arrays import Float32, Float64
 from gi_core.constants import SECTOR_SIZE_M
+from gi_core.dataset import Dataset
 from gi_core.grid import SectorIndex
 from server.raycast import RayCaster
 

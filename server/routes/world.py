@@ -3,9 +3,9 @@
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
-from gi_core.dataset import WorldInfo
 
 from gi_core.constants import MAX_PROBES_PER_SECTOR, SECTOR_SIZE_M, VOLUME_SHAPE, VOXEL_SIZE_M
+from gi_core.dataset import WorldInfo
 from gi_core.weather import WEATHER_RANGES, weather_presets
 from server.caching import Body, conditional, strong_etag
 from server.dependencies import MAX_PREVIEW_WIDTH, MAX_PROBE_RADIUS_M, NoQuery, ServiceDep

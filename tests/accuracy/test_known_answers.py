@@ -11,8 +11,9 @@ from gi_core.ambient_cube import project_radiance
 from gi_core.constants import ALBEDO_MAX, SKY_SHAPE, VOXEL_INDOORS, VOXEL_SOLID
 from gi_core.device import shared_device
 from gi_core.lighting import DirectionalLight, Lighting
-from gi_core.relight import Relighter, ResidentSector
+from gi_core.relight import Relighter
 from gi_core.relight_input import RelightInput, relight_input
+from gi_core.resident_sector import ResidentSector
 from gi_core.sector import Sector
 from gi_core.sun_table import SunTable
 from gi_core.world import Location, Room

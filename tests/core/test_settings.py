@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from gi_core.device import shared_device
 from gi_core.errors import InputError
 from gi_core.lighting import DirectionalLight, Lighting
-from gi_core.relight import Relighter, ResidentSector
+from gi_core.relight import Relighter
 from gi_core.relight_input import relight_input
+from gi_core.resident_sector import ResidentSector
 from gi_core.settings import MAX_FACTOR, NEUTRAL, Settings
 from gi_core.sun_table import SunTable
 from gi_core.world import Location

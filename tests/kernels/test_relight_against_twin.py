@@ -9,8 +9,9 @@ from gi_core import layout, pocl_cpu, relight_twin
 from gi_core.device import Device, available_devices, choose_device, describe, shared_device
 from gi_core.errors import DeviceError, KernelBuildError
 from gi_core.layout import DIRECTIONAL_LIGHT
-from gi_core.relight import Relighter, ResidentSector
-from gi_core.relight_input import RelightInput, visibility_cases
+from gi_core.relight import Relighter
+from gi_core.relight_input import RelightInput
+from gi_core.resident_sector import ResidentSector
 from gi_core.volume import box_record, plan_boxes
 from kernels_cl import include_directory
 
@@ -34,7 +35,6 @@ def given_light(seed: int, lights: int, planes: int = 12, snow: float = 0.0) -> 
         record["plane"] = rng.integers(0, planes, 4)
         weight = rng.uniform(0, 1, 4)
         record["plane_weight"] = weight / weight.sum()
-        record["visibility"] = visibility_cases(record["plane_weight"])
     return RelightInput(rng.uniform(0, 2e4, (PATCHES, 3)).astype(np.float32), records, snow)
 
 
@@ -182,7 +182,7 @@ def test_a_kernel_that_does_not_build_shows_the_compilers_words(device):
 
 def test_a_missing_define_stops_the_build(device):
     with pytest.raises(KernelBuildError, match="FEEDBACK_PROBES"):
-        device.kernel("relight_bricks", DIRECTIONAL_LIGHTS=1, HAS_EMISSION=0, HAS_SNOW=0, HAS_LAMPS=0, HAS_FEEDBACK_WEIGHTS=0)
+        device.kernel("collect_bounces", HAS_FEEDBACK_WEIGHTS=0, HAS_SNOW=0)
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,9 @@ import pytest
 
 from gi_core.device import shared_device
 from gi_core.layout import DIRECTIONAL_LIGHT
-from gi_core.relight import Relighter, ResidentSector
-from gi_core.relight_input import RelightInput, visibility_cases
+from gi_core.relight import Relighter
+from gi_core.relight_input import RelightInput
+from gi_core.resident_sector import ResidentSector
 
 PATCHES = 6
 DARK = RelightInput(np.zeros((PATCHES, 3), np.float32), np.zeros(0, DIRECTIONAL_LIGHT.dtype))
@@ -19,7 +20,6 @@ def sunlight(strength: float) -> RelightInput:
     sun["direction"][0, :3] = (0.36, 0.8, 0.48)
     sun["irradiance"][0, :3] = np.array([1.0, 0.9, 0.7]) * strength
     sun["plane"], sun["plane_weight"] = (0, 1, 2, 3), (0.4, 0.3, 0.2, 0.1)
-    sun["visibility"] = visibility_cases(sun["plane_weight"][0])
     return RelightInput(np.full((PATCHES, 3), strength * 0.1, np.float32), sun)
 
 

@@ -1,0 +1,250 @@
+"""One sector's buffers on a device, and the kernels that light them (slides "Relighting", "Multiple bounces").
+
+What changes seldom is worked out when it changes, and a pass only does what every bounce needs:
+
+    light changed   sun_on_surfels, light_bricks: direct exitance of bricks
+    snow changed    collect_bounces: what bricks send on of their feedback probes' light
+    every pass      bounce_bricks, gather_probes
+"""
+
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+
+from gi_core import relight_twin
+from gi_core.arrays import AnyArray, Float32, UInt32
+from gi_core.device import Device
+from gi_core.layout import BOUNCE
+from gi_core.relight_input import RelightInput
+from gi_core.sector import Sector, starts
+
+# Work-items per work-group; kernels guard against the last group's excess.
+GROUP = 16
+
+WEIGHTS_PER_VECTOR = 4
+SURFELS_PER_GROUP = 8  # of sun_on_surfels.cl: a byte of a plane's bits
+
+
+class LightOnDevice:
+    """What all sectors share of one moment's light, uploaded once: sky patches, sun and moon."""
+
+    def __init__(self, device: Device, given: RelightInput) -> None:
+        self.given = given
+        patches = np.zeros((len(given.patch_exitance), 4), np.float32)
+        patches[:, :3] = given.patch_exitance
+        self.patches = device.upload(patches)
+        self.lights = device.upload(given.lights) if len(given.lights) else None
+        self.identity = (given.lights.tobytes(), given.snow)
+        """What direct light and bounces depend on; sky patches are neither's."""
+
+
+class ResidentSector:
+    """One sector's buffers on a device. Only what the sector has and what the light asks for: no emission, no buffer."""
+
+    def __init__(self, device: Device, sector: Sector, sky_patches: int) -> None:
+        self.sector = sector
+        self.device = device
+        self.surfel_albedo = device.upload(np.concatenate([sector.surfel_albedo, sector.surfel_snow[:, None]], axis=1))
+        self._groups = -(-sector.surfel_count // SURFELS_PER_GROUP)
+        normal = np.zeros((3, SURFELS_PER_GROUP * self._groups), np.float32)
+        normal[:, : sector.surfel_count] = sector.surfel_normal.T
+        self.surfel_normal = device.upload(normal)
+        self.brick_starts = device.upload(sector.brick_starts)
+        self.brick_emission = None if sector.surfel_emission is None else device.upload(_brick_emission(sector))
+        self.factor_starts = device.upload(sector.factor_starts)
+        self.factor_source = device.upload(sector.factor_source)
+        self.factor_weight = device.upload(whole_vectors(sector.factor_weight))
+        self.voxel_probe = device.upload(sector.voxel_probe)
+        self.voxel_weight = device.upload(sector.voxel_weight)
+        self.cubes = device.allocate(sector.probe_count * sector.basis_size * 16)
+        self.direct = device.allocate(sector.brick_count * 16)
+        self.exitance = device.allocate((sector.brick_count + sky_patches) * 16)
+        # None of these is there before something needs it.
+        self.sun_visibility: cl.Buffer | None = None
+        self.sun_share: cl.Buffer | None = None
+        self.bounces: cl.Buffer | None = None
+        self.bounce_starts: cl.Buffer | None = None
+        self.sun_sample: cl.Buffer | None = None
+        self._lamps: cl.Buffer | None = None
+        self._has_snow = bool(sector.surfel_snow.any())
+        self._light: LightOnDevice | None = None
+        self._direct_of: object = None
+        self._bounces_of: float | None = None
+        self._kernels: dict[tuple[object, ...], cl.Kernel] = {}
+        self._pass: list[tuple[cl.Kernel, int]] = []
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes on the device."""
+        return sum(value.size for value in vars(self).values() if isinstance(value, cl.Buffer))
+
+    def set_lamps(self, surfel_light: cl.Buffer | None) -> None:
+        """Irradiance [lx] that lamps give each surfel: (S, 4) float32 on the device, or None where there are none.
+
+        To be called again when the contents have changed.
+        """
+        if surfel_light is not None or self._lamps is not None:
+            self._lamps, self._direct_of = surfel_light, None
+
+    def set_sun_sample(self, sun_sample: cl.Buffer | None) -> None:
+        """The surfels' samples of the sun's shadow map: uint8 on the device, padded to whole groups of
+        eight, or None without a map.
+
+        To be called again when the contents have changed.
+        """
+        if sun_sample is not None or self.sun_sample is not None:
+            self.sun_sample, self._direct_of = sun_sample, None
+
+    def light(self, light: LightOnDevice) -> None:
+        """Enqueue what the passes need to know of the light; nothing when it is as it was."""
+        if self.sector.probe_count == 0:
+            return
+        if light is not self._light:
+            cl.enqueue_copy(
+                self.device.queue, self.exitance, light.patches, byte_count=light.patches.size, dst_offset=self.sector.brick_count * 16
+            )
+            self._light = light
+        if self.sector.brick_count == 0:
+            return
+        snow = light.given.snow if self._has_snow else 0.0
+        if self._bounces_of != snow:
+            self._collect_bounces(snow)
+            self._bounces_of = snow
+        if self._direct_of != light.identity:
+            if light.lights is not None:
+                self._light_surfels(light)
+            self._light_bricks(light, snow)
+            self._direct_of = light.identity
+
+    def enqueue_pass(self) -> None:
+        """Enqueue one pass: one more bounce on the cubes that the sector holds."""
+        if not self._pass:
+            self._pass = self._bind_pass()
+        for kernel, items in self._pass:
+            self._run(kernel, items)
+
+    def fill_volume(self, box: AnyArray, size: tuple[int, ...], target: cl.Buffer) -> None:
+        """Enqueue this sector's part of a volume: ``box`` (1,) layout.VOLUME_BOX, its size (x, y, z), the volume's buffer."""
+        sector = self.sector
+        kernel = self._kernel("fill_volume", BASIS_SIZE=sector.basis_size, VOXEL_PROBES=sector.voxel_probe.shape[3])
+        kernel.set_args(box, self.voxel_probe, self.voxel_weight, self.cubes, target)
+        cl.enqueue_nd_range_kernel(self.device.queue, kernel, size, None)
+
+    def read_cubes(self) -> Float32:
+        """The probes' cubes (P, B, 3) float32 [lx], after all that was enqueued."""
+        cubes = np.zeros((self.sector.probe_count, self.sector.basis_size, 4), np.float32)
+        self.device.read(self.cubes, cubes)
+        return np.ascontiguousarray(cubes[..., :3])
+
+    def write_cubes(self, cubes: Float32) -> None:
+        """Set the probes' cubes (P, B, 3) float32 [lx]: where the next pass takes its feedback from."""
+        if cubes.size:
+            padded = np.zeros((*cubes.shape[:2], 4), np.float32)
+            padded[..., :3] = cubes
+            cl.enqueue_copy(self.device.queue, self.cubes, padded)
+
+    def _kernel(self, name: str, **defines: int) -> cl.Kernel:
+        # Making a kernel takes longer than running it.
+        key = (name, *defines.values())
+        if key not in self._kernels:
+            self._kernels[key] = self.device.kernel(name, **defines)
+        return self._kernels[key]
+
+    def _run(self, kernel: cl.Kernel, items: int) -> None:
+        cl.enqueue_nd_range_kernel(self.device.queue, kernel, (-(-items // GROUP) * GROUP,), (GROUP,))
+
+    def _light_surfels(self, light: LightOnDevice) -> None:
+        count = len(light.given.lights)
+        if self.sun_visibility is None:
+            self.sun_visibility = self.device.upload(self.sector.sun_visibility)
+        if self.sun_share is None or self.sun_share.size < count * self._groups * SURFELS_PER_GROUP * 4:
+            self.sun_share = self.device.allocate(count * self._groups * SURFELS_PER_GROUP * 4)
+        kernel = self._kernel("sun_on_surfels", DIRECTIONAL_LIGHTS=count, HAS_SUN_MAP=int(self.sun_sample is not None))
+        arguments: list[Any] = [np.uint32(self._groups), self.surfel_normal, self.sun_visibility]
+        arguments += [np.uint32(4 * self.sector.sun_visibility.shape[1]), light.lights]
+        if self.sun_sample is not None:
+            arguments.append(self.sun_sample)
+        kernel.set_args(*arguments, self.sun_share)
+        self._run(kernel, self._groups)
+
+    def _light_bricks(self, light: LightOnDevice, snow: float) -> None:
+        count = len(light.given.lights)
+        kernel = self._kernel(
+            "light_bricks",
+            DIRECTIONAL_LIGHTS=count,
+            HAS_EMISSION=int(self.brick_emission is not None),
+            HAS_SNOW=int(snow > 0),
+            HAS_LAMPS=int(self._lamps is not None),
+        )
+        arguments: list[Any] = [np.uint32(self.sector.brick_count), self.brick_starts, self.surfel_albedo]
+        arguments += [buffer for buffer in (self.brick_emission, self._lamps) if buffer is not None]
+        if count:
+            arguments += [self.sun_share, np.uint32(self._groups * SURFELS_PER_GROUP), light.lights]
+        arguments.append(self.direct)
+        if snow > 0:
+            arguments.append(np.float32(snow))
+        kernel.set_args(*arguments)
+        self._run(kernel, self.sector.brick_count)
+
+    def _collect_bounces(self, snow: float) -> None:
+        """Bounces of the sector under this much snow. Which there are does not depend on the snow: the first time counts them."""
+        sector, device = self.sector, self.device
+        weighted = sector.feedback_probe.shape[1] > 1 or not (sector.feedback_weight == 1).all()
+        kernel = self._kernel(
+            "collect_bounces",
+            FEEDBACK_PROBES=sector.feedback_probe.shape[1],
+            HAS_FEEDBACK_WEIGHTS=int(weighted),
+            HAS_SNOW=int(snow > 0),
+        )
+        probe = device.upload(sector.feedback_probe)
+        weight = [device.upload(sector.feedback_weight)] if weighted else []
+        count = device.allocate(4 * sector.brick_count)
+
+        def collect(bounce_starts: cl.Buffer, bounces: cl.Buffer) -> None:
+            last = [np.float32(snow)] if snow > 0 else []
+            surfels = [self.surfel_albedo, self.surfel_normal, np.uint32(self._groups * SURFELS_PER_GROUP)]
+            kernel.set_args(
+                np.uint32(sector.brick_count), self.brick_starts, *surfels, probe, *weight, bounce_starts, bounces, count, *last
+            )
+            self._run(kernel, sector.brick_count)
+
+        if self.bounce_starts is None:
+            most = 3 * sector.feedback_probe.shape[1]
+            # Not zeroed: most of it is never touched, and so never takes memory.
+            scratch = cl.Buffer(device.context, cl.mem_flags.READ_WRITE, most * sector.surfel_count * BOUNCE.dtype.itemsize)
+            collect(device.upload(most * sector.brick_starts), scratch)
+            counted: UInt32 = np.zeros(sector.brick_count, np.uint32)
+            device.read(count, counted)
+            self.bounce_starts = device.upload(starts(counted))
+            self.bounces = device.allocate(int(counted.sum()) * BOUNCE.dtype.itemsize)
+        assert self.bounces is not None
+        collect(self.bounce_starts, self.bounces)
+
+    def _bind_pass(self) -> list[tuple[cl.Kernel, int]]:
+        sector = self.sector
+        bound: list[tuple[cl.Kernel, int]] = []
+        if sector.probe_count and sector.brick_count:
+            kernel = self._kernel("bounce_bricks")
+            kernel.set_args(np.uint32(sector.brick_count), self.bounce_starts, self.bounces, self.direct, self.cubes, self.exitance)
+            bound.append((kernel, sector.brick_count))
+        if sector.probe_count:
+            vectors = -(-sector.basis_size // WEIGHTS_PER_VECTOR)
+            kernel = self._kernel("gather_probes", BASIS_SIZE=sector.basis_size, WEIGHT_VECTORS=vectors)
+            kernel.set_args(
+                np.uint32(sector.probe_count), self.factor_starts, self.factor_source, self.factor_weight, self.exitance, self.cubes
+            )
+            bound.append((kernel, sector.probe_count))
+        return bound
+
+
+def _brick_emission(sector: Sector) -> Float32:
+    """(N, 4) float32 [lx]: pi times the mean emission of each brick's surfels."""
+    assert sector.surfel_emission is not None
+    means = relight_twin.brick_means(sector, sector.surfel_emission)
+    return np.pad(np.float32(np.pi) * means, ((0, 0), (0, 1)))
+
+
+def whole_vectors(weights: Float32) -> Float32:
+    """Factor weights (F, B) padded with zeros to whole float4: (F, 4 n)."""
+    return np.pad(weights, ((0, 0), (0, -weights.shape[1] % WEIGHTS_PER_VECTOR)))

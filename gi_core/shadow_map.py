@@ -1,0 +1,175 @@
+"""The sun's shadow map on the device, and the surfels' samples of it (slide "Sun shadow").
+
+Drawn a few sectors at a time into a buffer of its own, and looked at only when whole: no tick waits for a map, and no surfel sees half
+of one. Queries never use it: their answer must not depend on where a player stands.
+"""
+
+from collections import OrderedDict
+from collections.abc import Callable
+
+import numpy as np
+import pyopencl as cl
+
+from gi_core.arrays import Float64, UInt8, UInt16
+from gi_core.constants import SURFEL_CELL_M
+from gi_core.device import Device
+from gi_core.geometry_file import Geometry
+from gi_core.grid import SectorIndex
+from gi_core.layout import NO_SAMPLE
+from gi_core.resident_sector import SURFELS_PER_GROUP, ResidentSector
+from gi_core.sector import counts
+from gi_core.shadow_plan import MAP_TEXELS, ShadowPlan, box_corners, oldest_fresh, triangle_records
+
+NOTHING_DRAWN = np.float32(-1e30)  # as in shadow_map.h
+# A band belongs to one work-item. A CPU wants some for each core; a GPU wants many.
+CPU_BANDS, GPU_BANDS = 8, 256
+# Triangles of sectors that stay on the device for the next map, 48 bytes each.
+KEPT_BYTES = 1 << 25
+# Maps are numbered with 16 bits; samples start anew when they run out.
+LAST_NUMBER = 0xFFFF
+
+
+class SunSamples:
+    """One resident sector's samples: share of the sun, and which map said so. 19 bytes a surfel; none before the first map.
+
+    sun_sample : (S padded to whole groups,) uint8 on the device: share of layout.WHOLE_SAMPLE, or NO_SAMPLE
+    sampled_in : (S,) uint16 on the device: the number of the map that a sample is from, 0 before any
+    """
+
+    def __init__(self, device: Device, resident: ResidentSector) -> None:
+        sector = resident.sector
+        place = np.empty((sector.surfel_count, 4), np.float32)
+        place[:, :3] = sector.surfel_position
+        place[:, 3] = np.repeat(SURFEL_CELL_M * 2.0 ** sector.brick_level.astype(np.float32), counts(sector.brick_starts))
+        self.resident = resident
+        self.place = device.upload(place)
+        padded = -(-sector.surfel_count // SURFELS_PER_GROUP) * SURFELS_PER_GROUP
+        self.sun_sample = device.upload(np.full(padded, NO_SAMPLE, np.uint8))
+        self.sampled_in = device.allocate(2 * sector.surfel_count)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes on the device."""
+        return int(self.place.size + self.sun_sample.size + self.sampled_in.size)
+
+    def read(self) -> tuple[UInt8, UInt16]:
+        """(S,) uint8 samples and (S,) uint16 map numbers: a surfel's source is the map when its number is the map's, its last sample
+        when it is an older one, and the bake where the sample is NO_SAMPLE."""
+        count = self.resident.sector.surfel_count
+        sample, sampled_in = np.zeros(count, np.uint8), np.zeros(count, np.uint16)
+        self.resident.device.read(self.sun_sample, sample)
+        self.resident.device.read(self.sampled_in, sampled_in)
+        return sample, sampled_in
+
+
+class ShadowMap:
+    """The map that is drawn, and the one that surfels look at. Not for several threads at once."""
+
+    def __init__(self, device: Device, geometry: Callable[[SectorIndex], Geometry], top_m: float) -> None:
+        """``geometry`` gives a sector's triangles (``Dataset.geometry``); ``top_m`` is the city's highest point, world frame."""
+        self.plan: ShadowPlan | None = None
+        """Of the map that surfels look at."""
+        self.number = 0
+        self._device = device
+        self._geometry = geometry
+        self._top_m = top_m
+        self._drawing: ShadowPlan | None = None
+        self._left: list[SectorIndex] = []
+        self._front, self._back = (cl.Buffer(device.context, cl.mem_flags.READ_WRITE, 4 * MAP_TEXELS**2) for _ in range(2))
+        self._draw = device.kernel("draw_shadow_map")
+        self._sample = device.kernel("sample_shadow_map")
+        self._bands = CPU_BANDS if device.device.type & cl.device_type.CPU else GPU_BANDS
+        self._triangles: OrderedDict[SectorIndex, tuple[cl.Buffer, int]] = OrderedDict()
+        self._drawn_for: list[tuple[int, Float64]] = []
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes on the device."""
+        return int(self._front.size + self._back.size + sum(buffer.size for buffer, _ in self._triangles.values()))
+
+    @property
+    def is_drawing(self) -> bool:
+        """Whether a map has been begun and not finished."""
+        return self._drawing is not None
+
+    def begin(self, plan: ShadowPlan) -> None:
+        """Start to draw another map; what was begun before is given up."""
+        self._drawing, self._left = plan, list(plan.sectors)
+        cl.enqueue_fill_buffer(self._device.queue, self._back, NOTHING_DRAWN, 0, self._back.size)
+
+    def draw(self, most_triangles: int) -> bool:
+        """Enqueue the drawing of some more sectors, at least one; whether the map is now whole and is the one that surfels look at.
+
+        Raises what ``geometry`` raises; the sector is then left out of this map.
+        """
+        plan = self._drawing
+        if plan is None:
+            return False
+        drawn = 0
+        while self._left and (drawn == 0 or drawn < most_triangles):
+            index = self._left.pop(0)
+            buffer, count = self._on_device(index)
+            self._enqueue(plan, index.origin, buffer, count)
+            drawn += count
+        if self._left:
+            return False
+        if plan.boxes:
+            corners = np.concatenate([box_corners(box) for box in plan.boxes]) - plan.middle
+            self._enqueue(plan, plan.middle, self._device.upload(triangle_records(corners)), len(corners))
+        self._front, self._back = self._back, self._front
+        self.plan, self._drawing = plan, None
+        if self.number == LAST_NUMBER:
+            self.number, self._drawn_for = 0, []
+        self.number += 1
+        self._drawn_for.append((self.number, plan.to_sun))
+        first = oldest_fresh([to_sun for _, to_sun in self._drawn_for], plan.to_sun)
+        del self._drawn_for[:first]
+        return True
+
+    def sample(self, samples: SunSamples) -> None:
+        """Enqueue a look at the map for all surfels of a sector, and have its next lighting use it."""
+        plan, resident = self.plan, samples.resident
+        if plan is None or resident.sector.surfel_count == 0:
+            return
+        if self.number == 1:  # the first map, or the first after numbers ran out: older samples say nothing
+            cl.enqueue_fill_buffer(self._device.queue, samples.sampled_in, np.uint16(0), 0, samples.sampled_in.size)
+        origin = resident.sector.index.origin
+        self._sample.set_args(
+            plan.frame(origin),
+            np.uint32(resident.sector.surfel_count),
+            samples.place,
+            resident.surfel_normal,
+            np.uint32(samples.sun_sample.size),
+            self._front,
+            np.float32(self._top_m - origin[1]),
+            np.float32(min(plan.reach_height_m, 1e9)),
+            np.uint16(self.number),
+            np.uint16(self._drawn_for[0][0]),
+            samples.sun_sample,
+            samples.sampled_in,
+        )
+        cl.enqueue_nd_range_kernel(self._device.queue, self._sample, (resident.sector.surfel_count,), None)
+        resident.set_sun_sample(samples.sun_sample)
+
+    def read(self) -> "np.ndarray[tuple[int, ...], np.dtype[np.float32]]":
+        """The map that surfels look at: (MAP_TEXELS, MAP_TEXELS) float32 [m], rows, columns."""
+        depth = np.zeros((MAP_TEXELS, MAP_TEXELS), np.float32)
+        self._device.read(self._front, depth)
+        return depth
+
+    def _enqueue(self, plan: ShadowPlan, origin: Float64, triangles: cl.Buffer, count: int) -> None:
+        if count:
+            rows = np.int32(-(-MAP_TEXELS // self._bands))
+            self._draw.set_args(plan.frame(origin), np.uint32(count), triangles, rows, self._back)
+            cl.enqueue_nd_range_kernel(self._device.queue, self._draw, (self._bands,), (1,))
+
+    def _on_device(self, index: SectorIndex) -> tuple[cl.Buffer, int]:
+        found = self._triangles.pop(index, None)
+        if found is None:
+            geometry = self._geometry(index)
+            records = triangle_records(geometry.vertices[geometry.triangles] - index.origin)
+            found = self._device.upload(records), len(records)
+        self._triangles[index] = found
+        while len(self._triangles) > 1 and sum(buffer.size for buffer, _ in self._triangles.values()) > KEPT_BYTES:
+            self._triangles.popitem(last=False)
+        return found

@@ -1,0 +1,159 @@
+"""Plans for the sun's shadow map: where it lies, what is drawn into it, when it is drawn anew. Pure; ``shadow_map`` carries them out."""
+
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gi_core.arrays import AnyArray, Float32, Float64
+from gi_core.constants import SECTOR_SIZE_M
+from gi_core.grid import SectorIndex
+from gi_core.layout import SHADOW_FRAME, SHADOW_TRIANGLE
+
+# 256 m across, so that all of a 100 m volume and the streets around it are inside; texels a quarter of a surfel's cell.
+MAP_TEXELS = 1024
+TEXELS_PER_METRE = 4.0
+# Geometry up to this far towards the sun is drawn [m]: beyond, a surfel's ray must be above the city or the baked visibility is used.
+MAX_REACH_M = 1500.0
+# The sun's disc is half a degree wide: a shadow's edge drawn this far off is still within its own penumbra.
+SUN_MOVED_DEGREES = 0.25
+# An eighth of the map: what the volume sees stays inside it.
+PLAYER_MOVED_M = 32.0
+BOX_MOVED_M = 0.5
+# A sample of a map drawn for a sun this far away still says more than baked directions many degrees apart.
+FRESH_DEGREES = 1.0
+# Below this the map's prism is longer than the reach for anything taller than a storey.
+LOWEST_SUN_DEGREES = 1.0
+
+
+@dataclass(frozen=True)
+class MovingBox:
+    """Something that moves and stands in the sun: a vehicle, a door.
+
+    position : (x, y, z) [m], world frame, the middle; half_size : along its own x, y and z [m]
+    turned_degrees : about the vertical, from +X towards -Z
+    """
+
+    position: tuple[float, float, float]
+    half_size: tuple[float, float, float]
+    turned_degrees: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class ShadowPlan:
+    """One drawing of the map.
+
+    middle : (3,) float64 [m], world frame; to_sun, across, down : (3,) float64, unit, at right angles
+    sectors : those whose geometry is drawn; boxes : moving ones, drawn last
+    reach_m : level distance towards the sun from any point of the map up to which all geometry is drawn
+    reach_height_m : how much higher a ray to the sun is by then; inf where it is above the whole city
+    """
+
+    middle: Float64
+    to_sun: Float64
+    across: Float64
+    down: Float64
+    sectors: tuple[SectorIndex, ...]
+    boxes: tuple[MovingBox, ...]
+    reach_m: float
+    reach_height_m: float
+
+    def frame(self, origin: Float64) -> AnyArray:
+        """(1,) layout.SHADOW_FRAME for points local to ``origin`` (3,) [m], world frame."""
+        record = np.zeros(1, SHADOW_FRAME.dtype)
+        record["across"], record["down"], record["to_sun"] = self.across, self.down, self.to_sun
+        record["texels_per_metre"], record["size"] = TEXELS_PER_METRE, MAP_TEXELS
+        record["origin"] = origin - self.middle
+        return record
+
+
+def plan_map(
+    position: Float64, to_sun: Float64, sectors: Collection[SectorIndex], low_m: float, top_m: float, boxes: Sequence[MovingBox] = ()
+) -> ShadowPlan | None:
+    """The map around a player at ``position`` (3,) [m] for a sun towards ``to_sun`` (3,), unit; None when the sun is too low for one.
+
+    sectors : all that have geometry; low_m, top_m : the city's lowest and highest point
+    """
+    if to_sun[1] < math.sin(math.radians(LOWEST_SUN_DEGREES)):
+        return None
+    level = np.cross((0.0, 1.0, 0.0), to_sun)
+    length = float(np.linalg.norm(level))
+    across = level / length if length > 1e-6 else np.array([1.0, 0.0, 0.0])
+    down = np.cross(to_sun, across)
+    # Whole texels along the map's own axes: under an unchanged sun, a map that has moved says the same of the same place.
+    steps = np.round(np.stack([across, down]) @ position * TEXELS_PER_METRE) / TEXELS_PER_METRE
+    middle = position + (steps - np.stack([across, down]) @ position) @ np.stack([across, down])
+    horizontal = math.hypot(to_sun[0], to_sun[2])
+    above_all = (top_m - low_m) * horizontal / float(to_sun[1])
+    reach = min(MAX_REACH_M, above_all)
+    height = math.inf if above_all <= MAX_REACH_M else MAX_REACH_M * float(to_sun[1]) / horizontal
+    drawn = _sectors_towards_sun(middle, to_sun, np.stack([across, down]), sectors, (low_m, top_m), reach)
+    return ShadowPlan(middle, to_sun, across, down, drawn, tuple(boxes), reach, height)
+
+
+def _sectors_towards_sun(
+    middle: Float64, to_sun: Float64, axes: Float64, sectors: Collection[SectorIndex], heights: tuple[float, float], reach: float
+) -> tuple[SectorIndex, ...]:
+    """Sectors whose columns meet the map's prism within the reach, in grid order."""
+    half = MAP_TEXELS / TEXELS_PER_METRE / 2
+    # No point of the map's receivers is further from its middle than its diagonal and the city's height allow.
+    radius = half * math.sqrt(2) + SECTOR_SIZE_M + reach + (heights[1] - heights[0])
+    x0, z0 = np.floor((middle[[0, 2]] - radius) / SECTOR_SIZE_M).astype(int)
+    x1, z1 = np.floor((middle[[0, 2]] + radius) / SECTOR_SIZE_M).astype(int)
+    near = sorted(i for i in sectors if x0 <= i.x <= x1 and z0 <= i.z <= z1)
+    if not near:
+        return ()
+    corner = np.array([[x, y, z] for x in (0.0, SECTOR_SIZE_M) for y in heights for z in (0.0, SECTOR_SIZE_M)])
+    corners = np.array([index.origin for index in near])[:, None] + corner - middle  # (n, 8, 3)
+    on_map = corners @ axes.T
+    meets = ((on_map.min(axis=1) <= half) & (on_map.max(axis=1) >= -half)).all(axis=1)
+    level = np.array([to_sun[0], to_sun[2]])
+    level /= max(float(np.linalg.norm(level)), 1e-9)
+    ahead = (corners[..., [0, 2]] @ level).min(axis=1)
+    # A receiver may lie as far ahead of the middle as the map reaches on the ground: its edge, stretched by a low sun.
+    stretched = half / max(float(to_sun[1]), 1e-3)
+    meets &= ahead <= min(stretched, half * 4) + reach
+    return tuple(index for index, ok in zip(near, meets.tolist(), strict=True) if ok)
+
+
+def needs_drawing(last: ShadowPlan | None, position: Float64, to_sun: Float64, boxes: Sequence[MovingBox]) -> bool:
+    """Whether sun, player or a box have moved enough since a map was planned for another to be drawn."""
+    if last is None:
+        return True
+    if float(last.to_sun @ to_sun) < math.cos(math.radians(SUN_MOVED_DEGREES)):
+        return True
+    if float(np.linalg.norm(position - last.middle)) > PLAYER_MOVED_M or len(boxes) != len(last.boxes):
+        return True
+    return any(math.dist(a.position, b.position) > BOX_MOVED_M for a, b in zip(boxes, last.boxes, strict=True))
+
+
+def oldest_fresh(drawn_for: Sequence[Float64], to_sun: Float64) -> int:
+    """Index of the first of a run of maps, oldest first, from which on each was drawn for a sun within FRESH_DEGREES of ``to_sun``."""
+    limit = math.cos(math.radians(FRESH_DEGREES))
+    first = len(drawn_for)
+    while first > 0 and float(drawn_for[first - 1] @ to_sun) >= limit:
+        first -= 1
+    return first
+
+
+def box_corners(box: MovingBox) -> Float64:
+    """The twelve triangles of a box: (12, 3, 3) float64 [m], world frame."""
+    turn = math.radians(box.turned_degrees)
+    ahead, side = np.array([math.cos(turn), 0.0, -math.sin(turn)]), np.array([math.sin(turn), 0.0, math.cos(turn)])
+    axes = np.stack([ahead * box.half_size[0], np.array([0.0, box.half_size[1], 0.0]), side * box.half_size[2]])
+    triangles = []
+    for axis in range(3):
+        other, third = axes[(axis + 1) % 3], axes[(axis + 2) % 3]
+        for sign in (-1, 1):
+            a, b, c, d = (sign * axes[axis] + i * other + j * third for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1)))
+            triangles += [np.stack([a, b, c]), np.stack([a, c, d])]
+    return np.stack(triangles) + np.array(box.position)
+
+
+def triangle_records(corners: Float64 | Float32) -> AnyArray:
+    """(n,) layout.SHADOW_TRIANGLE of triangles (n, 3, 3) [m], in their own frame."""
+    records = np.zeros(len(corners), SHADOW_TRIANGLE.dtype)
+    records["corner"] = corners[:, 0]
+    records["edge_a"], records["edge_b"] = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    return records

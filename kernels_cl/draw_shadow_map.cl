@@ -1,0 +1,73 @@
+// Draws triangles into the sun's shadow map (slide "Sun shadow").
+//
+//   map[row][column] = the greatest depth of all triangles over the texel's centre
+//
+// A work-item owns a band of rows and draws every triangle into it, so no two write the same place, nothing is atomic, and the map is
+// the same whatever order work-items run in. A triangle is a few spans, one for each row whose centre it covers:
+//
+//      o - - - - - - - -  row of texel centres above: not covered
+//      |\__
+//      |   \__
+//     -*--*--*\_ - - - -  span: the centres between two edges
+//      |        \__
+//
+// Depth is linear along a span. Global size: bands.
+#include "layout.h"
+#include "shadow_map.h"
+
+// Twice the area [texels^2] below which a triangle is seen edge on, and covers no centre that its neighbours do not.
+#define EDGE_ON 1e-6f
+
+__kernel void draw_shadow_map(
+    const ShadowFrame frame,
+    const uint triangles,
+    __global const ShadowTriangle *triangle,
+    const int rows_per_band,
+    __global float *map)
+{
+    const int size = (int)frame.size;
+    const int first_row = get_global_id(0) * rows_per_band;
+    if (first_row >= size)
+        return;
+    const int end_row = first_row + rows_per_band < size ? first_row + rows_per_band : size;
+    for (uint t = 0; t < triangles; ++t) {
+        __global const float *corner = triangle[t].corner, *a = triangle[t].edge_a, *b = triangle[t].edge_b;
+        const float4 p0 = map_from_sector(&frame, corner[0], corner[1], corner[2]);
+        const float4 p1 = map_from_sector(&frame, corner[0] + a[0], corner[1] + a[1], corner[2] + a[2]);
+        const float4 p2 = map_from_sector(&frame, corner[0] + b[0], corner[1] + b[1], corner[2] + b[2]);
+        const float low = p0.y < p1.y ? (p0.y < p2.y ? p0.y : p2.y) : (p1.y < p2.y ? p1.y : p2.y);
+        const float high = p0.y > p1.y ? (p0.y > p2.y ? p0.y : p2.y) : (p1.y > p2.y ? p1.y : p2.y);
+        if (!(high >= first_row + 0.5f && low <= end_row - 0.5f))
+            continue;
+        const float4 u = p1 - p0, v = p2 - p0;
+        const float area = u.x * v.y - v.x * u.y;
+        if (!(area > EDGE_ON || area < -EDGE_ON))
+            continue;
+        const float depth_by_column = (u.z * v.y - v.z * u.y) / area, depth_by_row = (v.z * u.x - u.z * v.x) / area;
+        const float from = low - 0.5f > first_row ? low - 0.5f : first_row, until = high - 0.5f < end_row - 1 ? high - 0.5f : end_row - 1;
+        const int row_of_low = (int)from + ((int)from < from), row_of_high = (int)until;
+        for (int row = row_of_low; row <= row_of_high; ++row) {
+            const float y = row + 0.5f;
+            float left = 1e30f, right = -1e30f;
+            for (int edge = 0; edge < 3; ++edge) {
+                const float4 start = edge == 0 ? p0 : edge == 1 ? p1 : p2, end = edge == 0 ? p1 : edge == 1 ? p2 : p0;
+                if ((start.y <= y) == (end.y <= y))
+                    continue;
+                const float x = start.x + (y - start.y) * (end.x - start.x) / (end.y - start.y);
+                left = x < left ? x : left;
+                right = x > right ? x : right;
+            }
+            left = left - 0.5f > 0.0f ? left - 0.5f : 0.0f;
+            right = right - 0.5f < size - 1 ? right - 0.5f : size - 1;
+            if (!(left <= right))
+                continue;
+            const float depth_at_zero = p0.z + depth_by_row * (y - p0.y) + depth_by_column * (0.5f - p0.x);
+            __global float *line = map + row * size;
+            for (int column = (int)left + ((int)left < left); column <= (int)right; ++column) {
+                const float depth = depth_at_zero + depth_by_column * column;
+                if (depth > line[column])
+                    line[column] = depth;
+            }
+        }
+    }
+}

@@ -1,0 +1,211 @@
+"""The sun's shadow map: kernels equal their twins, samples know their source, moving boxes cast shadows."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gi_core import shadow_map_twin
+from gi_core.device import Device, available_devices, describe, shared_device
+from gi_core.geometry_file import Geometry
+from gi_core.grid import SectorIndex
+from gi_core.layout import NO_SAMPLE, WHOLE_SAMPLE
+from gi_core.resident_sector import ResidentSector
+from gi_core.shadow_map import ShadowMap, SunSamples
+from gi_core.shadow_plan import MAP_TEXELS, MovingBox, box_corners, needs_drawing, oldest_fresh, plan_map
+
+ZERO = SectorIndex(0, 0)
+MIDDLE = np.array([32.0, 2.0, 32.0])
+TOP = 60.0
+
+
+@pytest.fixture(scope="module", params=[describe(d) for d in available_devices()])
+def device(request) -> Device:
+    return shared_device(request.param)
+
+
+def towards(elevation_degrees: float, azimuth_degrees: float = 25.0) -> np.ndarray:
+    elevation, azimuth = np.radians([elevation_degrees, azimuth_degrees])
+    return np.array([np.cos(elevation) * np.cos(azimuth), np.sin(elevation), np.cos(elevation) * np.sin(azimuth)])
+
+
+def geometry_of(corners: np.ndarray) -> Geometry:
+    count = len(corners)
+    triangles = np.arange(3 * count, dtype=np.int32).reshape(-1, 3)
+    return Geometry(corners.reshape(-1, 3), triangles, np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32))
+
+
+def drawn(device: Device, corners: np.ndarray, to_sun: np.ndarray, boxes=(), position=MIDDLE) -> ShadowMap:
+    shadow_map = ShadowMap(device, lambda _: geometry_of(corners), TOP)
+    plan = plan_map(position, to_sun, {ZERO}, 0.0, TOP, boxes)
+    assert plan is not None
+    shadow_map.begin(plan)
+    while not shadow_map.draw(10):
+        pass
+    return shadow_map
+
+
+def random_city(seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    boxes = [
+        MovingBox((x, h / 2, z), (rng.uniform(1, 8), h / 2, rng.uniform(1, 8)), rng.uniform(0, 90))
+        for x, z, h in zip(rng.uniform(0, 64, 12), rng.uniform(0, 64, 12), rng.uniform(2, TOP, 12), strict=True)
+    ]
+    loose = rng.uniform(0, 60, (40, 1, 3)) + rng.normal(0, 4, (40, 3, 3))
+    ground = np.array([[[-50.0, 0, -50], [150, 0, -50], [150, 0, 150]], [[-50, 0, -50], [150, 0, 150], [-50, 0, 150]]])
+    return np.concatenate([*(box_corners(box) for box in boxes), loose, ground])
+
+
+@pytest.mark.parametrize("elevation", [90.0, 62.0, 30.0, 6.0])
+def test_the_map_equals_its_twin(device, elevation):
+    corners = random_city(int(elevation))
+    shadow_map = drawn(device, corners, towards(elevation))
+    expected = shadow_map_twin.draw(shadow_map.plan, corners)
+    found = shadow_map.read()
+    # A centre that lies on an edge within float32's rounding may belong to either side of it: 2e-4 of a texel at 1024.
+    differs = np.abs(found - expected) > 2e-3
+    assert differs.mean() < 2e-4
+    assert (expected > shadow_map_twin.NOTHING_DRAWN).mean() > 0.05
+
+
+def samples_of(device, make_sector, seed: int, **changes) -> SunSamples:
+    sector = make_sector(seed, surfels=2000)
+    rng = np.random.default_rng(seed)
+    position = rng.uniform(0, 64, (sector.surfel_count, 3)) * [1, 0.5, 1]
+    fine = np.zeros_like(sector.brick_level)
+    sector = replace(sector, index=ZERO, surfel_position=position.astype(np.float32), brick_level=fine, **changes)
+    return SunSamples(device, ResidentSector(device, sector, 6))
+
+
+@pytest.mark.parametrize("elevation", [90.0, 62.0, 30.0, 6.0])
+def test_samples_equal_their_twin(device, make_sector, elevation):
+    corners = random_city(int(elevation))
+    shadow_map = drawn(device, corners, towards(elevation))
+    samples = samples_of(device, make_sector, 5)
+    shadow_map.sample(samples)
+    found, number = samples.read()
+    sector = samples.resident.sector
+    size = np.ones(sector.surfel_count)
+    share, valid = shadow_map_twin.sample(
+        shadow_map.plan, shadow_map.read(), sector.surfel_position.astype(float), sector.surfel_normal.astype(float), size, TOP
+    )
+    # One tap of sixteen may fall into the neighbouring texel, or a plane may touch what it is compared with.
+    assert ((number == 1) == valid).mean() > 0.999
+    both = (number == 1) & valid
+    assert both.sum() > 200
+    assert (found[~valid & (number != 1)] == NO_SAMPLE).all()
+    assert np.abs(found[both].astype(int) - share[both]).mean() < 0.01 * WHOLE_SAMPLE
+    assert 0.02 < (share[both] == WHOLE_SAMPLE).mean() < 0.9
+
+
+def test_a_floor_in_the_open_is_lit_and_one_under_a_roof_is_not(device, make_sector):
+    ground = random_city(1)[-2:]
+    roof = box_corners(MovingBox((32.0, 10.0, 32.0), (8.0, 0.5, 8.0)))
+    shadow_map = drawn(device, np.concatenate([ground, roof]), towards(60.0))
+    up = np.tile(np.float32([0, 1, 0]), (2000, 1))
+    samples = samples_of(device, make_sector, 5, surfel_normal=up)
+    position = samples.resident.sector.surfel_position.copy()
+    position[:, 1] = 0.0
+    samples = SunSamples(device, ResidentSector(device, replace(samples.resident.sector, surfel_position=position), 6))
+    shadow_map.sample(samples)
+    found, _ = samples.read()
+    moved = position - 10.0 / towards(60.0)[1] * -towards(60.0)
+    over = np.abs(moved[:, [0, 2]] - 32).max(axis=1)
+    assert (found[over > 10.5] == WHOLE_SAMPLE).all()
+    assert (found[over < 5.5] == 0).all()
+
+
+def test_a_moving_box_casts_a_shadow_and_takes_it_along(device, make_sector):
+    ground = random_city(1)[-2:]
+    up = np.tile(np.float32([0, 1, 0]), (2000, 1))
+    sector = samples_of(device, make_sector, 5, surfel_normal=up).resident.sector
+    flat = sector.surfel_position.copy()
+    flat[:, 1] = 0.0
+    samples = SunSamples(device, ResidentSector(device, replace(sector, surfel_position=flat), 6))
+    dark = []
+    for x in (20.0, 44.0):
+        shadow_map = drawn(device, ground, towards(90.0), (MovingBox((x, 1.5, 32.0), (6.0, 1.0, 6.0)),))
+        shadow_map.sample(samples)
+        found, _ = samples.read()
+        dark.append(flat[found == 0][:, 0])
+    assert 14 < dark[0].min() < dark[0].max() < 26
+    assert 38 < dark[1].min() < dark[1].max() < 50
+
+
+def test_each_surfel_knows_its_source(device, make_sector):
+    corners = random_city(3)
+    shadow_map = drawn(device, corners, towards(50.0))
+    samples = samples_of(device, make_sector, 5)
+    shadow_map.sample(samples)
+    first, _ = samples.read()
+    # The player leaves: the next map, for nearly the same sun, covers none of the surfels, whose samples stay.
+    away = plan_map(MIDDLE + np.array([2000.0, 0, 0]), towards(50.5), {ZERO}, 0.0, TOP)
+    shadow_map.begin(away)
+    assert shadow_map.draw(1)
+    shadow_map.sample(samples)
+    kept, number = samples.read()
+    normal = samples.resident.sector.surfel_normal
+    facing = np.all([normal @ towards(e) > 0.02 for e in (50.0, 50.5, 53.0)], axis=0)
+    np.testing.assert_array_equal(kept[facing], first[facing])
+    assert (number[facing & (first != NO_SAMPLE)] == 1).all()
+    # Then the sun moves on: what it says of the surfels is stale, and the bake takes over.
+    shadow_map.begin(plan_map(MIDDLE + np.array([2000.0, 0, 0]), towards(53.0), {ZERO}, 0.0, TOP))
+    shadow_map.draw(1)
+    shadow_map.sample(samples)
+    gone, _ = samples.read()
+    assert (gone[facing] == NO_SAMPLE).all()
+
+
+def test_a_ray_that_leaves_what_was_drawn_below_the_roofs_is_not_valid(device, make_sector):
+    shadow_map = ShadowMap(device, lambda _: geometry_of(random_city(3)), 2000.0)
+    plan = plan_map(MIDDLE, towards(30.0), {ZERO}, 0.0, 2000.0)
+    assert plan.reach_height_m < 2000.0
+    shadow_map.begin(plan)
+    shadow_map.draw(1)
+    samples = samples_of(device, make_sector, 5)
+    shadow_map.sample(samples)
+    facing = samples.resident.sector.surfel_normal @ towards(30.0) > 0.02
+    assert (samples.read()[0][facing] == NO_SAMPLE).all()
+
+
+def test_a_map_is_planned_anew_when_something_has_moved_enough():
+    plan = plan_map(MIDDLE, towards(50.0), {ZERO}, 0.0, TOP, (MovingBox((0, 0, 0), (1, 1, 1)),))
+    box = (MovingBox((0.3, 0, 0), (1, 1, 1)),)
+    assert not needs_drawing(plan, MIDDLE + 10.0, towards(50.1), box)
+    assert needs_drawing(None, MIDDLE, towards(50.0), ())
+    assert needs_drawing(plan, MIDDLE, towards(50.3), box)
+    assert needs_drawing(plan, MIDDLE + 40.0, towards(50.0), box)
+    assert needs_drawing(plan, MIDDLE, towards(50.0), (MovingBox((0.6, 0, 0), (1, 1, 1)),))
+    assert needs_drawing(plan, MIDDLE, towards(50.0), ())
+    assert plan_map(MIDDLE, towards(0.5), {ZERO}, 0.0, TOP) is None
+
+
+def test_sectors_towards_the_sun_are_drawn_and_others_are_not():
+    sectors = {SectorIndex(x, z) for x in range(-40, 41) for z in range(-40, 41)}
+    plan = plan_map(MIDDLE, towards(10.0, 0.0), sectors, 0.0, TOP)
+    drawn_x = [index.x for index in plan.sectors]
+    assert max(drawn_x) * 64 >= 128 + plan.reach_m - 64
+    assert max(abs(index.z) for index in plan.sectors) <= 4
+    assert len(plan.sectors) < 200
+    overhead = plan_map(MIDDLE, towards(90.0), sectors, 0.0, TOP)
+    assert {(i.x, i.z) for i in overhead.sectors} == {(x, z) for x in range(-2, 3) for z in range(-2, 3)}
+
+
+def test_maps_are_fresh_while_the_sun_stands_near_theirs():
+    drawn_for = [towards(e) for e in (40.0, 40.6, 41.2, 41.5)]
+    assert oldest_fresh(drawn_for, towards(41.5)) == 1
+    assert oldest_fresh(drawn_for, towards(60.0)) == 4
+
+
+def test_an_unchanged_sun_gives_the_same_texels_wherever_the_player_stands(device):
+    corners = random_city(7)
+    here, there = (drawn(device, corners, towards(40.0), position=MIDDLE + np.array([x, 0, 0])) for x in (0.0, 3.7))
+    shift = np.round((there.plan.middle - here.plan.middle) @ np.stack([here.plan.across, here.plan.down], axis=1) * 4).astype(int)
+    a, b = here.read(), there.read()
+    height = (there.plan.middle - here.plan.middle) @ here.plan.to_sun
+    x, y = shift
+    inner = slice(64, MAP_TEXELS - 64)
+    moved = np.roll(b, (y, x), (0, 1)) + height
+    close = np.abs(a - moved)[inner, inner] < 5e-3
+    both = (a[inner, inner] > -1e29) & (moved[inner, inner] > -1e29)
+    assert close[both].mean() > 0.999
