@@ -64,18 +64,20 @@ class StreamState:
         return cls(np.zeros(count, np.int64), np.zeros(count, bool), np.zeros(count))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class StreamPlan:
     """What to do now: the evictions first, then the loads in this order.
 
     left_out : sectors that a volume reads now and that the budget has no room for
     missing : sectors that a volume reads now and that are not resident, for whatever reason: they are late
+    needs : what the plan was made from, a row for each sector of the table; tick_plan wants it too
     """
 
     loads: tuple[SectorIndex, ...]
     evictions: tuple[SectorIndex, ...]
     left_out: tuple[SectorIndex, ...]
     missing: tuple[SectorIndex, ...]
+    needs: Needs
 
 
 def retry_delay_s(attempts: int) -> float:
@@ -125,7 +127,7 @@ def plan_streaming(
     def named(rows: list[int]) -> tuple[SectorIndex, ...]:
         return tuple(table.sectors[row] for row in rows)
 
-    return StreamPlan(named(loads), named(room.evicted), named(left_out), named(missing))
+    return StreamPlan(named(loads), named(room.evicted), named(left_out), named(missing), needs)
 
 
 class _Room:

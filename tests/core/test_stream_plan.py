@@ -318,3 +318,11 @@ def test_options_that_could_not_stream_are_refused(wrong: dict[str, float]) -> N
         StreamOptions(**{"budget_bytes": 10, **wrong})  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="byte"):
         SectorTable.of({SectorIndex(0, 0): 0})
+
+
+def test_a_plan_tells_how_far_players_are_for_who_lights_sectors() -> None:
+    table = make_table(3, holes=0.0)
+    positions = np.array([[10.0, 1.5, 10.0], [-100.0, 1.5, 70.0]])
+    plan = plan_streaming(table, StreamState.empty(table), positions, 0 * positions, now_s=0.0, options=StreamOptions(1000))
+    standing = {sector_of(position) for position in positions}
+    assert {table.sectors[row] for row in np.flatnonzero(plan.needs.away_m == 0)} == standing
