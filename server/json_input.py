@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 from gi_core.errors import InputError
@@ -64,6 +65,21 @@ def numbers(value: Any, where: str, count: int, low: float, high: float) -> tupl
     if not isinstance(value, list | tuple) or len(value) != count:
         raise InputError(f"{where}: expected {count} numbers, found {shown(value)}")
     return tuple(number(part, where, low, high) for part in value)
+
+
+def read_text(path: Path, most_bytes: int) -> str:
+    """A small UTF-8 file of the user's. Raises InputError when it cannot be read, or is larger than such a file should be."""
+    try:
+        with path.open("rb") as file:
+            data = file.read(most_bytes + 1)
+    except (OSError, ValueError) as error:  # a name with a zero byte is a ValueError
+        raise InputError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
+    if len(data) > most_bytes:
+        raise InputError(f"{path}: expected at most {most_bytes} bytes, found more")
+    try:
+        return data.decode()
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: expected UTF-8 text ({error})") from error
 
 
 def shown(value: Any) -> str:
