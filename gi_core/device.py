@@ -13,6 +13,7 @@ from gi_core.errors import DeviceError, KernelBuildError
 from kernels_cl import include_directory, source
 
 ENVIRONMENT = "SECTORLIGHT_DEVICE"
+GROUP = 16  # work-items per work-group
 
 
 def available_devices() -> list[cl.Device]:
@@ -111,6 +112,14 @@ class Device:
         expected = [record.dtype.itemsize for record in layout.RECORDS]
         if sizes.tolist() != expected:
             raise KernelBuildError(f"{self.name} lays out records in {sizes.tolist()} bytes, the host in {expected}")
+
+
+def run_1d(device: Device, kernel: cl.Kernel, items: int) -> None:
+    """Enqueue a kernel for some work-items, rounded up to whole work-groups of GROUP: kernels guard against the excess.
+
+    Always the same group size: PoCL compiles a kernel anew for each, and would choose one for every number of items.
+    """
+    cl.enqueue_nd_range_kernel(device.queue, kernel, (-(-items // GROUP) * GROUP,), (GROUP,))
 
 
 @lru_cache(maxsize=4)

@@ -23,7 +23,7 @@ from gi_core.relight_input import relight_input, sky_face_exitance
 from gi_core.resident_sector import ResidentSector
 from gi_core.sector import PROBE_IN_MARGIN
 from gi_core.settings import NEUTRAL, Settings
-from gi_core.volume import SectorBox, Volume, box_mask, box_record, fill_missing_columns, plan_boxes
+from gi_core.volume import SectorBox, Volume, box_mask, box_record, box_slices, nearest_columns, plan_boxes
 from gi_core.world import Lamp
 
 # Device memory that queries may keep sectors in.
@@ -139,10 +139,12 @@ class Engine:
             target = self._device.allocate(values.nbytes)
             unlit = [box for box in boxes if not self._fill(box, light, target, mask)]
             self._device.read(target, values)
-        lit_mask = mask.copy()
+        has_light = mask[0] != VOXEL_NO_SECTOR
         for box in unlit:  # it has air, but no probe: lit like columns without a sector, by the nearest that are
-            lit_mask[_slices(box)] = VOXEL_NO_SECTOR
-        fill_missing_columns(values, lit_mask)
+            has_light[box_slices(box)[1:]] = False
+        if has_light.any() and not has_light.all():
+            lack, nearest = nearest_columns(has_light)
+            values[:, :, lack[:, 0], lack[:, 1]] = values[:, :, nearest[:, 0], nearest[:, 1]]
         report = self.dataset.world.error_report
         expected = None if report is None else report.get("expected_error")
         return Volume(values, mask, first, tuple(box.index for box in boxes), self.dataset.world.basis, expected)
@@ -186,7 +188,7 @@ class Engine:
         resident.write_cubes(cubes)
         if sector.probe_count:
             resident.fill_volume(box_record(box, sector), tuple(int(n) for n in box.size), target)
-        mask[_slices(box)] = box_mask(box, sector)
+        mask[box_slices(box)] = box_mask(box, sector)
         return sector.probe_count > 0
 
     def _set_lamps(self, resident: ResidentSector, lamps: tuple[Lamp, ...]) -> None:
@@ -225,9 +227,3 @@ class Engine:
         low, high = (", ".join(f"{v:.1f}" for v in corner) for corner in self.dataset.world.bounds)
         here = ", ".join(f"{v:g}" for v in position)
         return f"position ({here}) is outside this world; expected x, y, z [m] within ({low}) and ({high})"
-
-
-def _slices(box: SectorBox) -> tuple[slice, slice, slice]:
-    """Where a box lies in its volume's (y, z, x)."""
-    (x, y, z), (nx, ny, nz) = box.volume_first.tolist(), box.size.tolist()
-    return slice(y, y + ny), slice(z, z + nz), slice(x, x + nx)

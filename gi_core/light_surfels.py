@@ -43,6 +43,11 @@ class SurfelLights:
         held += [traced.shadow_bits for lit in (self._static, self._dynamic) for traced in lit.traced]
         return sum(int(buffer.size) for buffer in held if buffer is not None)
 
+    @property
+    def given(self) -> tuple[tuple[Lamp, ...], tuple[Lamp, ...]]:
+        """The static and the dynamic lamps as they were given last."""
+        return self._static.given, self._dynamic.given
+
     def set_static(self, lamps: Sequence[Lamp]) -> None:
         """Lamps that seldom change: all of the world that are on, not only those near. Nothing happens when they are the same as before,
         and shadows stay when only lumens and colours have changed.

@@ -14,14 +14,12 @@ import pyopencl as cl
 
 from gi_core import relight_twin
 from gi_core.arrays import AnyArray, Float32, UInt32
-from gi_core.device import Device
+from gi_core.device import Device, run_1d
 from gi_core.layout import BOUNCE
 from gi_core.relight_input import RelightInput
 from gi_core.sector import Sector, starts
 
-# Work-items per work-group; kernels guard against the last group's excess.
-GROUP = 16
-
+VOXEL_GROUP = (8, 4, 1)  # work-items of fill_volume.cl along x, y, z; see run_1d
 WEIGHTS_PER_VECTOR = 4
 SURFELS_PER_GROUP = 8  # of sun_on_surfels.cl: a byte of a plane's bits
 
@@ -58,7 +56,7 @@ class ResidentSector:
         self.voxel_probe = device.upload(sector.voxel_probe)
         self.voxel_weight = device.upload(sector.voxel_weight)
         self.cubes = device.allocate(sector.probe_count * sector.basis_size * 16)
-        self.direct = device.allocate(sector.brick_count * 16)
+        self.direct = device.allocate((sector.brick_count + sky_patches) * 16)
         self.exitance = device.allocate((sector.brick_count + sky_patches) * 16)
         # None of these is there before something needs it.
         self.sun_visibility: cl.Buffer | None = None
@@ -78,6 +76,12 @@ class ResidentSector:
     def nbytes(self) -> int:
         """Bytes on the device."""
         return sum(value.size for value in vars(self).values() if isinstance(value, cl.Buffer))
+
+    def prepare(self) -> None:
+        """Do now what the first light would wait for, should another thread have the time."""
+        if self.sector.probe_count and self.sector.brick_count:
+            self._collect_bounces(0.0)
+            self._bounces_of = 0.0
 
     def set_lamps(self, surfel_light: cl.Buffer | None) -> None:
         """Irradiance [lx] that lamps give each surfel: (S, 4) float32 on the device, or None where there are none.
@@ -101,9 +105,9 @@ class ResidentSector:
         if self.sector.probe_count == 0:
             return
         if light is not self._light:
-            cl.enqueue_copy(
-                self.device.queue, self.exitance, light.patches, byte_count=light.patches.size, dst_offset=self.sector.brick_count * 16
-            )
+            behind = self.sector.brick_count * 16
+            for sources in (self.exitance, self.direct):
+                cl.enqueue_copy(self.device.queue, sources, light.patches, byte_count=light.patches.size, dst_offset=behind)
             self._light = light
         if self.sector.brick_count == 0:
             return
@@ -122,14 +126,23 @@ class ResidentSector:
         if not self._pass:
             self._pass = self._bind_pass()
         for kernel, items in self._pass:
-            self._run(kernel, items)
+            run_1d(self.device, kernel, items)
 
-    def fill_volume(self, box: AnyArray, size: tuple[int, ...], target: cl.Buffer) -> None:
-        """Enqueue this sector's part of a volume: ``box`` (1,) layout.VOLUME_BOX, its size (x, y, z), the volume's buffer."""
+    def gather_first_bounce(self, cubes: cl.Buffer) -> None:
+        """Enqueue what one pass from darkness gives, into other cubes than the sector's own: sky and the first surface alone."""
+        if self.sector.probe_count:
+            run_1d(self.device, self._gather("first", self.direct, cubes), self.sector.probe_count)
+
+    def fill_volume(self, box: AnyArray, size: tuple[int, ...], target: cl.Buffer, cubes: cl.Buffer | None = None) -> None:
+        """Enqueue this sector's part of a volume: ``box`` (1,) layout.VOLUME_BOX, its size (x, y, z), the volume's buffer.
+
+        ``cubes`` are shown in place of the sector's own.
+        """
         sector = self.sector
         kernel = self._kernel("fill_volume", BASIS_SIZE=sector.basis_size, VOXEL_PROBES=sector.voxel_probe.shape[3])
-        kernel.set_args(box, self.voxel_probe, self.voxel_weight, self.cubes, target)
-        cl.enqueue_nd_range_kernel(self.device.queue, kernel, size, None)
+        kernel.set_args(box, self.voxel_probe, self.voxel_weight, self.cubes if cubes is None else cubes, target)
+        whole = tuple(-(-count // group) * group for count, group in zip(size, VOXEL_GROUP, strict=True))
+        cl.enqueue_nd_range_kernel(self.device.queue, kernel, whole, VOXEL_GROUP)
 
     def read_cubes(self) -> Float32:
         """The probes' cubes (P, B, 3) float32 [lx], after all that was enqueued."""
@@ -151,9 +164,6 @@ class ResidentSector:
             self._kernels[key] = self.device.kernel(name, **defines)
         return self._kernels[key]
 
-    def _run(self, kernel: cl.Kernel, items: int) -> None:
-        cl.enqueue_nd_range_kernel(self.device.queue, kernel, (-(-items // GROUP) * GROUP,), (GROUP,))
-
     def _light_surfels(self, light: LightOnDevice) -> None:
         count = len(light.given.lights)
         if self.sun_visibility is None:
@@ -166,7 +176,7 @@ class ResidentSector:
         if self.sun_sample is not None:
             arguments.append(self.sun_sample)
         kernel.set_args(*arguments, self.sun_share)
-        self._run(kernel, self._groups)
+        run_1d(self.device, kernel, self._groups)
 
     def _light_bricks(self, light: LightOnDevice, snow: float) -> None:
         count = len(light.given.lights)
@@ -185,7 +195,7 @@ class ResidentSector:
         if snow > 0:
             arguments.append(np.float32(snow))
         kernel.set_args(*arguments)
-        self._run(kernel, self.sector.brick_count)
+        run_1d(self.device, kernel, self.sector.brick_count)
 
     def _collect_bounces(self, snow: float) -> None:
         """Bounces of the sector under this much snow. Which there are does not depend on the snow: the first time counts them."""
@@ -207,7 +217,7 @@ class ResidentSector:
             kernel.set_args(
                 np.uint32(sector.brick_count), self.brick_starts, *surfels, probe, *weight, bounce_starts, bounces, count, *last
             )
-            self._run(kernel, sector.brick_count)
+            run_1d(self.device, kernel, sector.brick_count)
 
         if self.bounce_starts is None:
             most = 3 * sector.feedback_probe.shape[1]
@@ -229,13 +239,19 @@ class ResidentSector:
             kernel.set_args(np.uint32(sector.brick_count), self.bounce_starts, self.bounces, self.direct, self.cubes, self.exitance)
             bound.append((kernel, sector.brick_count))
         if sector.probe_count:
-            vectors = -(-sector.basis_size // WEIGHTS_PER_VECTOR)
-            kernel = self._kernel("gather_probes", BASIS_SIZE=sector.basis_size, WEIGHT_VECTORS=vectors)
-            kernel.set_args(
-                np.uint32(sector.probe_count), self.factor_starts, self.factor_source, self.factor_weight, self.exitance, self.cubes
-            )
-            bound.append((kernel, sector.probe_count))
+            bound.append((self._gather("pass", self.exitance, self.cubes), sector.probe_count))
         return bound
+
+    def _gather(self, use: str, sources: cl.Buffer, cubes: cl.Buffer) -> cl.Kernel:
+        """gather_probes.cl from other sources into other cubes: a kernel for each use, since arguments stay bound."""
+        sector = self.sector
+        defines = {"BASIS_SIZE": sector.basis_size, "WEIGHT_VECTORS": -(-sector.basis_size // WEIGHTS_PER_VECTOR)}
+        key = ("gather_probes", use)
+        if key not in self._kernels:
+            self._kernels[key] = self.device.kernel("gather_probes", **defines)
+        kernel = self._kernels[key]
+        kernel.set_args(np.uint32(sector.probe_count), self.factor_starts, self.factor_source, self.factor_weight, sources, cubes)
+        return kernel
 
 
 def _brick_emission(sector: Sector) -> Float32:

@@ -77,17 +77,26 @@ class Settings:
             return lamps
         return tuple(replace(lamp, lumens=lamp.lumens * self.lights_factor) for lamp in lamps if self.lights_factor > 0)
 
+    @property
+    def has_ambient(self) -> bool:
+        """Whether the ambient colours add anything."""
+        return self.ambient_factor > 0 and any((*self.ambient_up, *self.ambient_down))
+
+    @property
+    def ambient_cubes(self) -> Float32:
+        """(2, 6, 3) float32 [lx]: what the ambient colours add to probes outdoors, and in rooms."""
+        up, down = (np.array(c) * self.ambient_factor for c in (self.ambient_up, self.ambient_down))
+        side = (up + down) / 2
+        ambient = np.stack([side, side, up, down, side, side]).astype(np.float32)
+        return np.array([self.exterior_ambient_scale, self.interior_ambient_scale], np.float32)[:, None, None] * ambient
+
     def cubes(self, first_bounce: Float32, converged: Float32, room: UInt16) -> Float32:
         """Probe cubes (P, 6, 3) [lx] from those with one bounce and with all, and each probe's room (P,)."""
         cubes = converged
         if self.bounce_factor != 1.0:
             cubes = first_bounce + np.float32(self.bounce_factor) * (converged - first_bounce)
-        up, down = (np.array(c) * self.ambient_factor for c in (self.ambient_up, self.ambient_down))
-        if up.any() or down.any():
-            side = (up + down) / 2
-            ambient = np.stack([side, side, up, down, side, side]).astype(np.float32)
-            scale = np.where(room == ROOM_OUTDOORS, self.exterior_ambient_scale, self.interior_ambient_scale).astype(np.float32)
-            cubes = cubes + scale[:, None, None] * ambient
+        if self.has_ambient:
+            cubes = cubes + self.ambient_cubes[(room != ROOM_OUTDOORS).astype(np.intp)]
         return cubes
 
 

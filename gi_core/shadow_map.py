@@ -10,10 +10,9 @@ from collections.abc import Callable
 import numpy as np
 import pyopencl as cl
 
-from gi_core.arrays import Float64, UInt8, UInt16
+from gi_core.arrays import AnyArray, Float32, Float64, UInt8, UInt16
 from gi_core.constants import SURFEL_CELL_M
-from gi_core.device import Device
-from gi_core.geometry_file import Geometry
+from gi_core.device import Device, run_1d
 from gi_core.grid import SectorIndex
 from gi_core.layout import NO_SAMPLE
 from gi_core.resident_sector import SURFELS_PER_GROUP, ResidentSector
@@ -65,13 +64,14 @@ class SunSamples:
 class ShadowMap:
     """The map that is drawn, and the one that surfels look at. Not for several threads at once."""
 
-    def __init__(self, device: Device, geometry: Callable[[SectorIndex], Geometry], top_m: float) -> None:
-        """``geometry`` gives a sector's triangles (``Dataset.geometry``); ``top_m`` is the city's highest point, world frame."""
+    def __init__(self, device: Device, casters: Callable[[SectorIndex], AnyArray], top_m: float) -> None:
+        """``casters`` gives a sector's triangles as records of layout.SHADOW_TRIANGLE, local to it; ``top_m`` is the city's highest
+        point, world frame."""
         self.plan: ShadowPlan | None = None
         """Of the map that surfels look at."""
         self.number = 0
         self._device = device
-        self._geometry = geometry
+        self._casters = casters
         self._top_m = top_m
         self._drawing: ShadowPlan | None = None
         self._left: list[SectorIndex] = []
@@ -100,7 +100,7 @@ class ShadowMap:
     def draw(self, most_triangles: int) -> bool:
         """Enqueue the drawing of some more sectors, at least one; whether the map is now whole and is the one that surfels look at.
 
-        Raises what ``geometry`` raises; the sector is then left out of this map.
+        Raises what ``casters`` raises; the sector is then left out of this map.
         """
         plan = self._drawing
         if plan is None:
@@ -148,10 +148,10 @@ class ShadowMap:
             samples.sun_sample,
             samples.sampled_in,
         )
-        cl.enqueue_nd_range_kernel(self._device.queue, self._sample, (resident.sector.surfel_count,), None)
+        run_1d(self._device, self._sample, resident.sector.surfel_count)
         resident.set_sun_sample(samples.sun_sample)
 
-    def read(self) -> "np.ndarray[tuple[int, ...], np.dtype[np.float32]]":
+    def read(self) -> Float32:
         """The map that surfels look at: (MAP_TEXELS, MAP_TEXELS) float32 [m], rows, columns."""
         depth = np.zeros((MAP_TEXELS, MAP_TEXELS), np.float32)
         self._device.read(self._front, depth)
@@ -166,8 +166,7 @@ class ShadowMap:
     def _on_device(self, index: SectorIndex) -> tuple[cl.Buffer, int]:
         found = self._triangles.pop(index, None)
         if found is None:
-            geometry = self._geometry(index)
-            records = triangle_records(geometry.vertices[geometry.triangles] - index.origin)
+            records = self._casters(index)
             found = self._device.upload(records), len(records)
         self._triangles[index] = found
         while len(self._triangles) > 1 and sum(buffer.size for buffer, _ in self._triangles.values()) > KEPT_BYTES:

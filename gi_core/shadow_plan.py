@@ -8,6 +8,7 @@ import numpy as np
 
 from gi_core.arrays import AnyArray, Float32, Float64
 from gi_core.constants import SECTOR_SIZE_M
+from gi_core.geometry_file import Geometry
 from gi_core.grid import SectorIndex
 from gi_core.layout import SHADOW_FRAME, SHADOW_TRIANGLE
 
@@ -157,3 +158,8 @@ def triangle_records(corners: Float64 | Float32) -> AnyArray:
     records["corner"] = corners[:, 0]
     records["edge_a"], records["edge_b"] = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     return records
+
+
+def caster_records(geometry: Geometry, index: SectorIndex) -> AnyArray:
+    """(n,) layout.SHADOW_TRIANGLE of a sector's geometry, local to the sector."""
+    return triangle_records(geometry.vertices[geometry.triangles] - index.origin)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from gi_core.ambient_cube import basis_weights
-from gi_core.arrays import AnyArray, Float32, Float64, Int64, UInt8
-from gi_core.constants import SECTOR_SIZE_M, VOLUME_SHAPE, VOXEL_INDOORS, VOXEL_NO_SECTOR, VOXEL_OUTDOORS, VOXEL_SIZE_M, VOXEL_SOLID
+from gi_core.arrays import AnyArray, Bool, Float32, Float64, Int64, UInt8
+from gi_core.constants import SECTOR_SIZE_M, VOLUME_SHAPE, VOXEL_INDOORS, VOXEL_OUTDOORS, VOXEL_SIZE_M, VOXEL_SOLID
 from gi_core.grid import SectorIndex, voxel_centre, voxel_columns
 from gi_core.layout import VOLUME_BOX
 from gi_core.sector import Sector
@@ -111,14 +111,16 @@ def box_mask(box: SectorBox, sector: Sector) -> UInt8:
     return mask
 
 
-def fill_missing_columns(values: Float32, mask: UInt8) -> None:
-    """Give columns without a sector the light of the nearest column that has one, in place: a volume has no black edge."""
-    missing = mask[0] == VOXEL_NO_SECTOR
-    if not missing.any() or missing.all():
-        return
-    have, lack = np.argwhere(~missing), np.argwhere(missing)
-    nearest = have[np.argmin(((lack[:, None] - have[None]) ** 2).sum(axis=2), axis=1)]
-    values[:, :, lack[:, 0], lack[:, 1]] = values[:, :, nearest[:, 0], nearest[:, 1]]
+def box_slices(box: SectorBox) -> tuple[slice, slice, slice]:
+    """Where a box lies in its volume's (y, z, x)."""
+    (x, y, z), (nx, ny, nz) = box.volume_first.tolist(), box.size.tolist()
+    return slice(y, y + ny), slice(z, z + nz), slice(x, x + nx)
+
+
+def nearest_columns(has_light: Bool) -> tuple[Int64, Int64]:
+    """Columns (n, 2), (z, x), without light, and for each the nearest that has some: a volume has no black edge."""
+    have, lack = np.argwhere(has_light), np.argwhere(~has_light)
+    return lack, have[np.argmin(((lack[:, None] - have[None]) ** 2).sum(axis=2), axis=1)]
 
 
 def sample_volume(values: Float32, origin: Float64, voxel_size: Float64, points: Float64, normals: Float32) -> Float32:

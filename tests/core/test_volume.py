@@ -5,9 +5,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gi_core.ambient_cube import basis_weights, evaluate, project_radiance
-from gi_core.constants import VOLUME_SHAPE, VOXEL_NO_SECTOR, VOXEL_OUTDOORS, VOXEL_SOLID
+from gi_core.constants import VOLUME_SHAPE, VOXEL_SOLID
 from gi_core.grid import sector_of, voxel_centre
-from gi_core.volume import box_mask, fill_missing_columns, plan_boxes, sample_coefficients, sample_volume, sector_slices
+from gi_core.volume import box_mask, nearest_columns, plan_boxes, sample_coefficients, sample_volume, sector_slices
 
 lattice = st.integers(-1_000_000, 1_000_000)
 
@@ -52,14 +52,13 @@ def test_a_client_reads_a_quarter_voxel_off_the_surface():
     np.testing.assert_allclose(found, 2.25, rtol=1e-6)
 
 
-def test_columns_without_a_sector_take_the_nearest_ones_light():
-    values = np.zeros((6, *VOLUME_SHAPE, 3), np.float32)
-    mask = np.full(VOLUME_SHAPE, VOXEL_NO_SECTOR, np.uint8)
-    mask[:, :, :4] = VOXEL_OUTDOORS
-    values[:, :, :, :4] = np.arange(1, 5, dtype=np.float32)[:, None]
-    fill_missing_columns(values, mask)
-    assert (values[:, :, :, 4:] == 4).all()
-    assert (values > 0).all()
+def test_columns_without_light_copy_the_nearest_that_have_some():
+    has_light = np.zeros(VOLUME_SHAPE[1:], bool)
+    has_light[:, :4] = True
+    lack, nearest = nearest_columns(has_light)
+    assert len(lack) == (~has_light).sum()
+    assert (lack[:, 1] >= 4).all()
+    np.testing.assert_array_equal(nearest, np.stack([lack[:, 0], np.full(len(lack), 3)], axis=1))
 
 
 def test_heights_beyond_a_sectors_layers_read_its_lowest_and_highest(make_sector):

@@ -7,12 +7,11 @@ import pytest
 
 from gi_core import shadow_map_twin
 from gi_core.device import Device, available_devices, describe, shared_device
-from gi_core.geometry_file import Geometry
 from gi_core.grid import SectorIndex
 from gi_core.layout import NO_SAMPLE, WHOLE_SAMPLE
 from gi_core.resident_sector import ResidentSector
 from gi_core.shadow_map import ShadowMap, SunSamples
-from gi_core.shadow_plan import MAP_TEXELS, MovingBox, box_corners, needs_drawing, oldest_fresh, plan_map
+from gi_core.shadow_plan import MAP_TEXELS, MovingBox, box_corners, needs_drawing, oldest_fresh, plan_map, triangle_records
 
 ZERO = SectorIndex(0, 0)
 MIDDLE = np.array([32.0, 2.0, 32.0])
@@ -29,14 +28,8 @@ def towards(elevation_degrees: float, azimuth_degrees: float = 25.0) -> np.ndarr
     return np.array([np.cos(elevation) * np.cos(azimuth), np.sin(elevation), np.cos(elevation) * np.sin(azimuth)])
 
 
-def geometry_of(corners: np.ndarray) -> Geometry:
-    count = len(corners)
-    triangles = np.arange(3 * count, dtype=np.int32).reshape(-1, 3)
-    return Geometry(corners.reshape(-1, 3), triangles, np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32))
-
-
 def drawn(device: Device, corners: np.ndarray, to_sun: np.ndarray, boxes=(), position=MIDDLE) -> ShadowMap:
-    shadow_map = ShadowMap(device, lambda _: geometry_of(corners), TOP)
+    shadow_map = ShadowMap(device, lambda _: triangle_records(corners), TOP)
     plan = plan_map(position, to_sun, {ZERO}, 0.0, TOP, boxes)
     assert plan is not None
     shadow_map.begin(plan)
@@ -157,7 +150,7 @@ def test_each_surfel_knows_its_source(device, make_sector):
 
 
 def test_a_ray_that_leaves_what_was_drawn_below_the_roofs_is_not_valid(device, make_sector):
-    shadow_map = ShadowMap(device, lambda _: geometry_of(random_city(3)), 2000.0)
+    shadow_map = ShadowMap(device, lambda _: triangle_records(random_city(3)), 2000.0)
     plan = plan_map(MIDDLE, towards(30.0), {ZERO}, 0.0, 2000.0)
     assert plan.reach_height_m < 2000.0
     shadow_map.begin(plan)

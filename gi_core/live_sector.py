@@ -1,0 +1,205 @@
+"""A resident sector of the live world: its light, which goes on from tick to tick, and what of it is shown."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from threading import Lock
+
+import numpy as np
+import pyopencl as cl
+
+from gi_core.arrays import Float32, Float64
+from gi_core.device import Device, run_1d
+from gi_core.light_blend import LightVector
+from gi_core.light_geometry import ShadowGeometry
+from gi_core.light_surfels import SurfelLights
+from gi_core.lighting import Lighting
+from gi_core.relight import Relighter
+from gi_core.relight_input import RelightInput, sky_face_exitance
+from gi_core.resident_sector import ResidentSector
+from gi_core.sector import Sector
+from gi_core.settings import Settings
+from gi_core.shadow_map import ShadowMap, SunSamples
+from gi_core.world import Lamp
+
+# After a change this large, as a share, a relight makes several passes, so that bounces follow at once.
+BURST_CHANGE = 0.05
+BURST_PASSES = 3
+# From loaded to fully shown: half a second at 30 Hz, so that nothing pops when a sector arrives late.
+FADE_TICKS = 15
+
+
+@dataclass(frozen=True, eq=False)
+class LiveLight:
+    """One tick's light as sectors take it.
+
+    lighting : the tick's snapshot, the settings' gains on it applied; given : the same as relighting takes it
+    vector : of ``given``
+    static_lamps, dynamic_lamps : those that are on, the settings' gain applied
+    standing : nothing of it is going to change by itself
+    """
+
+    lighting: Lighting
+    given: RelightInput
+    vector: LightVector
+    static_lamps: tuple[Lamp, ...]
+    dynamic_lamps: tuple[Lamp, ...]
+    settings: Settings
+    standing: bool
+
+    @property
+    def sun_is_up(self) -> bool:
+        """Whether the first of the lights is the sun."""
+        return bool((self.lighting.sun.irradiance > 0).any())
+
+    @cached_property
+    def distant(self) -> Float32:
+        """(6, 3) float32 [lx]: what a distant probe's sky factors multiply."""
+        return sky_face_exitance(self.lighting)
+
+
+class LiveSector:
+    """One sector that is lit tick by tick. Made by a loader's thread, then the ticker's alone."""
+
+    def __init__(self, device: Device, sector: Sector, sky_patches: int, geometry: ShadowGeometry, tracing: Lock) -> None:
+        """``tracing`` is held while lamps' shadows are traced: ``geometry`` is shared, and not for two threads at once."""
+        self.resident = ResidentSector(device, sector, sky_patches)
+        self.resident.prepare()
+        self.lamps = SurfelLights(device, sector, geometry)
+        self.samples: SunSamples | None = None
+        self.sampled_in = 0
+        """Number of the shadow map that its samples are from; 0 before any."""
+        self.change = 1.0
+        """How far its light is from what it should be, beyond what the sky's own change says: 0 is settled."""
+        self.exact = False
+        """Whether it holds the very bytes that a query would give for a light that stands still."""
+        self.lit_by: LightVector | None = None
+        self.shown_at = -1
+        """The last tick in which what is shown of it changed."""
+        self._device = device
+        self._tracing = tracing
+        self._low, self._high = _bounds(sector)
+        self._faded = 0
+        self._cubes: Float32 = np.zeros((sector.probe_count, sector.basis_size, 3), np.float32)
+        self._shown: cl.Buffer | None = None
+        self._kernels: dict[bool, cl.Kernel] = {}
+        self._first: cl.Buffer | None = None
+        self._room: cl.Buffer | None = None
+        self._blended_at = -1
+        self._lamps_late = False
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes on the device."""
+        own = sum(int(b.size) for b in (self._shown, self._first, self._room) if b is not None)
+        return self.resident.nbytes + self.lamps.nbytes + own + (self.samples.nbytes if self.samples else 0)
+
+    @property
+    def is_fading(self) -> bool:
+        """Whether it is still blended with what stood in for it."""
+        return self._faded < FADE_TICKS
+
+    def sample_sun(self, shadow_map: ShadowMap) -> None:
+        """Take samples of a shadow map that was just drawn; they light the sector at its next relight."""
+        if self.samples is None:
+            self.samples = SunSamples(self._device, self.resident)
+        shadow_map.sample(self.samples)
+        self.sampled_in = shadow_map.number
+        self.change, self.exact = max(self.change, BURST_CHANGE), False
+
+    def drop_sun_samples(self) -> None:
+        """Back to the bake's visibility: the sun has set, or there is no map any more."""
+        if self.samples is not None:
+            self.samples, self.sampled_in = None, 0
+            self.resident.set_sun_sample(None)
+            self.change, self.exact = max(self.change, BURST_CHANGE), False
+
+    def set_lamps(self, light: LiveLight, wait: bool) -> bool:
+        """Have the next relight read these lamps; whether it will: without ``wait``, not while another thread traces shadows."""
+        if self.lamps.given == (light.static_lamps, light.dynamic_lamps):
+            return True
+        if not self._tracing.acquire(blocking=wait):
+            return False
+        try:
+            before = self.lamps.buffer
+            self.lamps.set_static(light.static_lamps)
+            self.lamps.set_dynamic(light.dynamic_lamps)
+        finally:
+            self._tracing.release()
+        if before is not None or self.lamps.buffer is not None:
+            self.resident.set_lamps(self.lamps.buffer)
+        return True
+
+    def reaches(self, position: Float64, range_m: float) -> bool:
+        """Whether a lamp at a world position (3,) [m] may light one of its surfels."""
+        local = position - self.resident.sector.index.origin
+        beyond = local - np.clip(local, self._low, self._high)
+        return bool(beyond @ beyond < range_m * range_m)
+
+    def relight(self, relighter: Relighter, light: LiveLight, passes: int) -> None:
+        """Enqueue lamps and passes. ``measure`` must follow."""
+        self._lamps_late = not self.set_lamps(light, wait=False)
+        relighter.relight([self.resident], light.given, passes)
+
+    def measure(self, light: LiveLight) -> None:
+        """Read what a relight gave, and how far it moved."""
+        after = self.resident.read_cubes()
+        peak = float(after.max(initial=0.0))
+        moved = float(np.abs(after - self._cubes).max(initial=0.0))
+        self.change = 1.0 if self._lamps_late else moved / peak if peak > 0 else float(moved > 0)
+        self._cubes, self.lit_by, self.exact = after, light.vector, False
+
+    def settle(self, relighter: Relighter, light: LiveLight) -> None:
+        """Converge from darkness, as a query does: what is held then depends on the light alone, and on nothing that was before."""
+        self._cubes = relighter.converge(self.resident, light.given).cubes
+        self.change, self.lit_by, self.exact = 0.0, light.vector, True
+
+    def advance(self, tick: int, changed: bool) -> None:
+        """Say whether what is shown changes at a tick: by a relight or other gains (``changed``), or because it fades in."""
+        if self.lit_by is not None and self._faded < FADE_TICKS:
+            self._faded += 1
+            changed = True
+        if changed:
+            self.shown_at = tick
+
+    def shown(self, settings: Settings, placeholder: Callable[[], Float32]) -> cl.Buffer:
+        """The cubes to show, on the device: the sector's own, or a blend with ``placeholder`` (6, 3) [lx] while it fades in, under the
+        artists' gains."""
+        if not self.is_fading and settings.bounce_factor == 1.0 and not settings.has_ambient:
+            self._shown = self._first = self._room = None
+            return self.resident.cubes
+        if self._shown is None or self._blended_at != self.shown_at:
+            self._blend(settings, placeholder())
+            self._blended_at = self.shown_at
+        assert self._shown is not None
+        return self._shown
+
+    def _blend(self, settings: Settings, placeholder: Float32) -> None:
+        device, resident = self._device, self.resident
+        sector = resident.sector
+        rows = sector.probe_count * sector.basis_size
+        if self._shown is None:
+            self._shown = device.allocate(16 * rows)
+            self._room = device.upload(sector.probe_room)
+        gains = settings.bounce_factor != 1.0
+        ambient = np.zeros((2, sector.basis_size, 4), np.float32)
+        ambient[:, :, :3] = settings.ambient_cubes
+        standing_in = np.pad(placeholder.astype(np.float32), ((0, 0), (0, 1)))
+        arguments: list[object] = [np.uint32(rows), resident.cubes]
+        if gains:
+            self._first = self._first or device.allocate(16 * rows)
+            resident.gather_first_bounce(self._first)
+            arguments += [self._first, np.float32(settings.bounce_factor)]
+        if gains not in self._kernels:
+            self._kernels[gains] = device.kernel("show_probes", CUBE_ROWS=sector.basis_size, HAS_BOUNCE_FACTOR=int(gains))
+        kernel = self._kernels[gains]
+        uploads = device.upload(ambient), device.upload(standing_in)
+        kernel.set_args(*arguments, self._room, *uploads, np.float32(self._faded / FADE_TICKS), self._shown)
+        if rows:
+            run_1d(device, kernel, rows)
+
+
+def _bounds(sector: Sector) -> tuple[Float64, Float64]:
+    """The corners (3,) [m] of the box of a sector's surfels, sector-local; without any, of an empty one at its origin."""
+    position = sector.surfel_position if sector.surfel_count else np.zeros((1, 3))
+    return position.min(axis=0).astype(np.float64), position.max(axis=0).astype(np.float64)

@@ -1,0 +1,135 @@
+"""A player's irradiance volume in the live world: kept on the device, and filled anew only where light has changed or the player moved."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import pyopencl as cl
+
+from gi_core.arrays import AnyArray, Float32, Float64, Int64, UInt8
+from gi_core.constants import VOLUME_SHAPE, VOXEL_NO_SECTOR
+from gi_core.device import Device
+from gi_core.grid import SectorIndex, volume_first_voxel
+from gi_core.live_sector import LiveSector
+from gi_core.volume import SectorBox, box_mask, box_record, box_slices, nearest_columns, plan_boxes
+
+# Cubes of a sector to show at this tick, on the device.
+ShownCubes = Callable[[LiveSector], cl.Buffer]
+
+
+@dataclass(frozen=True, eq=False)
+class PublishedVolume:
+    """What clients see of a player's volume; read-only, and replaced by another when something changes.
+
+    values : (6, 16, 32, 32, 3) float32 [lx]; mask : (16, 32, 32) uint8, as in volume.Volume
+    first_voxel : (3,) int64, world lattice index of voxel (0, 0, 0)
+    tick : in which it was filled; missing : sectors that it touches and that are not there (yet)
+    """
+
+    values: Float32
+    mask: UInt8
+    first_voxel: Int64
+    tick: int
+    sectors: tuple[SectorIndex, ...]
+    missing: tuple[SectorIndex, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Layout:
+    """What does not change while the volume stays and the same sectors are there.
+
+    boxes : parts that lit sectors fill, with their records; mask : all classes
+    placeholders : sectors of the world that are not there, with the columns (z, x) that stand for each
+    outside : columns (z, x) without a sector, and for each the column that it copies
+    """
+
+    boxes: tuple[tuple[SectorBox, AnyArray], ...]
+    mask: UInt8
+    sectors: tuple[SectorIndex, ...]
+    placeholders: tuple[tuple[SectorIndex, slice, slice], ...]
+    outside: tuple[Int64, Int64] | None
+
+
+class LiveVolume:
+    """One player's. The ticker's alone; what it publishes is anybody's."""
+
+    def __init__(self, device: Device) -> None:
+        self.published: PublishedVolume | None = None
+        self.wanted_since = -1
+        """The tick since which it waits to be filled; -1 when it does not."""
+        self._device = device
+        self._first: Int64 | None = None
+        self._layout: _Layout | None = None
+        self._present: frozenset[SectorIndex] = frozenset()
+        self._buffer = device.allocate(4 * 3 * 6 * int(np.prod(VOLUME_SHAPE)))
+        self._filled_at = -1
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes on the device."""
+        return int(self._buffer.size)
+
+    def is_stale(self, position: Float64, residents: Mapping[SectorIndex, LiveSector], known: frozenset[SectorIndex]) -> bool:
+        """Whether a player at ``position`` (3,) [m] would see another volume than the published one. ``known``: sectors of the world."""
+        first = volume_first_voxel(position)
+        if self._first is None or not np.array_equal(first, self._first):
+            self._first = first
+            self._layout = None
+            self._touched = tuple(box.index for box in plan_boxes(first) if box.index in known)
+        present = frozenset(i for i in self._touched if i in residents and residents[i].lit_by is not None)
+        if present != self._present:
+            self._present, self._layout = present, None
+        if self._layout is None or self.published is None:
+            return True
+        return any(residents[index].shown_at > self._filled_at for index in present)
+
+    def fill(
+        self,
+        tick: int,
+        residents: Mapping[SectorIndex, LiveSector],
+        known: frozenset[SectorIndex],
+        shown: ShownCubes,
+        placeholder: Callable[[SectorIndex], Float32],
+    ) -> PublishedVolume:
+        """Fill what has changed and publish it. ``is_stale`` comes first: it is what looks at the position."""
+        assert self._first is not None
+        fresh = self._layout is None
+        layout = self._layout = self._layout or _lay_out(self._first, residents, known, self._present)
+        for box, record in layout.boxes:
+            sector = residents[box.index]
+            if fresh or sector.shown_at > self._filled_at:
+                sector.resident.fill_volume(record, tuple(int(n) for n in box.size), self._buffer, shown(sector))
+        values = np.empty((6, *VOLUME_SHAPE, 3), np.float32)
+        self._device.read(self._buffer, values)
+        for index, z, x in layout.placeholders:
+            values[:, :, z, x] = placeholder(index)[:, None, None, None]
+        if layout.outside is not None:
+            lack, nearest = layout.outside
+            values[:, :, lack[:, 0], lack[:, 1]] = values[:, :, nearest[:, 0], nearest[:, 1]]
+        values.setflags(write=False)
+        self._filled_at, self.wanted_since = tick, -1
+        missing = tuple(index for index, _, _ in layout.placeholders)
+        self.published = PublishedVolume(values, layout.mask, self._first, tick, layout.sectors, missing)
+        return self.published
+
+
+def _lay_out(
+    first: Int64, residents: Mapping[SectorIndex, LiveSector], known: frozenset[SectorIndex], present: frozenset[SectorIndex]
+) -> _Layout:
+    mask = np.full(VOLUME_SHAPE, VOXEL_NO_SECTOR, np.uint8)
+    has_light = np.zeros(VOLUME_SHAPE[1:], bool)
+    boxes, placeholders = [], []
+    for box in plan_boxes(first):
+        _, z, x = box_slices(box)
+        if box.index in present:
+            sector = residents[box.index].resident.sector
+            mask[box_slices(box)] = box_mask(box, sector)
+            if sector.probe_count:
+                boxes.append((box, box_record(box, sector)))
+                has_light[z, x] = True
+        elif box.index in known:
+            placeholders.append((box.index, z, x))
+            has_light[z, x] = True
+    mask.setflags(write=False)
+    outside = None if has_light.all() or not has_light.any() else nearest_columns(has_light)
+    return _Layout(tuple(boxes), mask, tuple(sorted(present)), tuple(placeholders), outside)

@@ -1,0 +1,273 @@
+"""The live world's light: sectors streamed around players, two of them relit every tick, volumes filled where something has changed.
+
+A tick, in order:
+
+    take over    sectors that loaders have finished
+    stream       plan loads and evictions for where players are and go
+    relight      the sectors that tick_plan chooses; in an idle world one sector that has not settled exactly
+    shadow map   draw some more of the next one; sectors take samples of one that was just drawn
+    volumes      of players who moved, or near whom something was relit, until the tick's time for it is spent; the rest wait
+
+Lighting belongs to the world: players share lit sectors, only volumes are theirs. One thread calls ``tick``; what it publishes is
+anybody's. No file is read and no kernel compiled in it, once ``warm_up`` has run.
+"""
+
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import product
+
+import numpy as np
+import pyopencl as cl
+
+from gi_core.arrays import Float32, Float64
+from gi_core.constants import VOLUME_SHAPE
+from gi_core.dataset import Dataset
+from gi_core.device import Device
+from gi_core.grid import SectorIndex, volume_first_voxel
+from gi_core.layout import DIRECTIONAL_LIGHT, MAX_DIRECTIONAL_LIGHTS
+from gi_core.light_blend import relative_changes
+from gi_core.light_geometry import ShadowGeometry
+from gi_core.live_sector import BURST_CHANGE, BURST_PASSES, LiveLight, LiveSector
+from gi_core.live_shadows import LiveShadows
+from gi_core.live_volume import LiveVolume
+from gi_core.relight import Relighter
+from gi_core.relight_input import RelightInput
+from gi_core.sector import Sector
+from gi_core.settings import NEUTRAL, Settings
+from gi_core.shadow_plan import MovingBox
+from gi_core.stream import Streamer, sector_table
+from gi_core.stream_need import distance_m
+from gi_core.stream_plan import StreamOptions, StreamPlan
+from gi_core.tick_plan import NEVER_RELIT, PLACES, SETTLED_CHANGE, plan_tick
+from gi_core.volume import box_record, plan_boxes
+
+DEFAULT_BUDGET_BYTES = 384 << 20
+
+
+@dataclass(frozen=True, eq=False)
+class TickPlayers:
+    """Where players are. ids (p,); positions, velocities : (p, 3) float64 [m], [m/s], world frame."""
+
+    ids: tuple[str, ...]
+    positions: Float64
+    velocities: Float64
+
+
+@dataclass(eq=False)
+class TickReport:
+    """What a tick did. Times in milliseconds.
+
+    relit, settled : sectors that were lit; missing : those that volumes read and that are not there
+    filled : players whose volume was filled; waiting : how many volumes wait for another tick
+    """
+
+    tick: int
+    relit: tuple[SectorIndex, ...] = ()
+    settled: tuple[SectorIndex, ...] = ()
+    loaded: tuple[SectorIndex, ...] = ()
+    evicted: tuple[SectorIndex, ...] = ()
+    missing: tuple[SectorIndex, ...] = ()
+    filled: tuple[str, ...] = ()
+    waiting: int = 0
+    passes: int = 0
+    ms: dict[str, float] = field(default_factory=dict)
+
+
+class LiveWorld:
+    """Sectors, volumes and the shadow map of a running world."""
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        device: str | None = None,
+        *,
+        budget_bytes: int = DEFAULT_BUDGET_BYTES,
+        places: int = PLACES,
+        shadow_map: bool = True,
+        stream: StreamOptions | None = None,
+    ) -> None:
+        """A queue of its own on the device, so that queries and ticks do not wait for each other.
+
+        budget_bytes : of resident sectors on the device; places : sectors to relight in a tick
+        Raises DeviceError.
+        """
+        self.dataset = dataset
+        self.volumes: dict[str, LiveVolume] = {}
+        self.plan: StreamPlan | None = None
+        self._device = Device(device)
+        self._relighter = Relighter(self._device)
+        self._places = places
+        self._known = frozenset(dataset.world.sectors)
+        self._geometry = ShadowGeometry(dataset.geometry, dataset.world.sectors)
+        self._tracing = threading.Lock()
+        self.streamer = Streamer(sector_table(dataset.world), dataset.sector, self._place, stream or StreamOptions(budget_bytes))
+        self._relit_at: dict[SectorIndex, int] = {}
+        self._light: LiveLight | None = None
+        self._distant_sky = dataset.distant()
+        self._shadows = LiveShadows(self._device, dataset) if shadow_map else None
+
+    @property
+    def device_name(self) -> str:
+        """The device's platform, name and version."""
+        return self._device.name
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes on the device: sectors, volumes, the shadow map."""
+        residents = sum(sector.nbytes for sector in list(self.streamer.residents.values()))
+        return residents + sum(v.nbytes for v in list(self.volumes.values())) + (self._shadows.nbytes if self._shadows else 0)
+
+    def tick(
+        self, tick: int, players: TickPlayers, light: LiveLight, boxes: Sequence[MovingBox] = (), fill_ms: float = np.inf
+    ) -> TickReport:
+        """One tick: see the top of this file. ``fill_ms``: when so much time has passed since its start, no other volume is filled."""
+        started = time.perf_counter()
+        report = TickReport(tick)
+
+        def lap(name: str) -> None:
+            report.ms[name] = (time.perf_counter() - started) * 1e3 - sum(report.ms.values())
+
+        report.loaded = tuple(self.streamer.take_over())
+        for index in report.loaded:
+            self._relit_at[index] = NEVER_RELIT
+        self.plan = self.streamer.step(players.positions, players.velocities)
+        report.evicted, report.missing = self.plan.evictions, self.plan.missing
+        for index in report.evicted:
+            self._relit_at.pop(index, None)
+        lap("stream")
+        gains_changed = self._light is not None and self._light.settings != light.settings
+        self._light = light
+        self._relight(tick, players, light, report)
+        lap("relight")
+        if self._shadows is not None:
+            self._shadows.step(players.positions, light.given, light.sun_is_up, boxes, self.streamer.residents)
+        lap("shadow_map")
+        lit = set(report.relit) | set(report.settled)
+        for index, sector in self.streamer.residents.items():
+            sector.advance(tick, gains_changed or index in lit)
+        self._fill(tick, players, light, report, started + fill_ms / 1e3)
+        lap("volumes")
+        return report
+
+    def warm_up(self) -> None:
+        """Compile and run every kernel that light may ask for, on the dataset's smallest lit sector: a first run takes seconds, later
+        ones find PoCL's cache. Raises what reading that sector raises."""
+        world = self.dataset.world
+        lit = [index for index, facts in world.sectors.items() if facts.probes and facts.bricks]
+        if not lit:
+            return
+        index = min(lit, key=lambda i: (world.sectors[i].surfels, i))
+        sector = self._place(self.dataset.sector(index))
+        lamp_light = self._device.allocate(16 * sector.resident.sector.surfel_count)
+        samples = self._device.allocate(sector.resident.sector.surfel_count + 8)
+        for lights, snow, lamps, sun_map in product(range(MAX_DIRECTIONAL_LIGHTS + 1), (0.0, 0.5), (None, lamp_light), (None, samples)):
+            sector.resident.set_lamps(lamps)
+            sector.resident.set_sun_sample(sun_map)
+            given = RelightInput(np.ones((world.sky_patches, 3), np.float32), np.zeros(lights, DIRECTIONAL_LIGHT.dtype), snow)
+            self._relighter.relight([sector.resident], given)
+        for settings in (NEUTRAL, Settings(bounce_factor=2.0)):
+            box = plan_boxes(volume_first_voxel(index.origin + 32.0))[0]
+            target = self._device.allocate(4 * 18 * int(np.prod(VOLUME_SHAPE)))
+            cubes = sector.shown(settings, lambda: np.zeros((6, 3), np.float32))
+            sector.resident.fill_volume(box_record(box, sector.resident.sector), (1, 1, 1), target, cubes)
+        if self._shadows is not None:
+            self._shadows.warm_up(sector)
+        self._device.queue.finish()
+
+    def close(self) -> None:
+        """Stop the threads that read."""
+        self.streamer.close()
+        if self._shadows is not None:
+            self._shadows.close()
+
+    def lamps_moved(self, touched: Sequence[tuple[Float64, float]]) -> None:
+        """Lamps at positions (3,) [m] with ranges [m] have changed: sectors with a surface in range need light at once."""
+        for sector in self.streamer.residents.values():
+            if any(sector.reaches(position, range_m) for position, range_m in touched):
+                sector.change, sector.exact = 1.0, False
+
+    def _place(self, sector: Sector) -> LiveSector:
+        """In a loader's thread: on the device, with the shadows of the lamps that shine now."""
+        placed = LiveSector(self._device, sector, self.dataset.world.sky_patches, self._geometry, self._tracing)
+        if self._light is not None:
+            placed.set_lamps(self._light, wait=True)
+        return placed
+
+    def _relight(self, tick: int, players: TickPlayers, light: LiveLight, report: TickReport) -> None:
+        residents = self.streamer.residents
+        if not residents:
+            return
+        indices = list(residents)
+        sectors = [residents[index] for index in indices]
+        changes = self._changes(sectors, light)
+        places = np.array(indices, np.int64).reshape(-1, 2)
+        away = distance_m(places, players.positions)
+        relit_at = np.array([self._relit_at[index] for index in indices], np.int64)
+        chosen = plan_tick(tick, relit_at, changes, away, places=self._places)
+        for row in chosen:
+            passes = BURST_PASSES if changes[row] > BURST_CHANGE else 1
+            sectors[row].relight(self._relighter, light, passes)
+            report.passes += passes
+        for row in chosen:
+            sectors[row].measure(light)
+            self._relit_at[indices[row]] = tick
+        report.relit = tuple(indices[row] for row in chosen)
+        if not chosen and light.standing:
+            # An idle world has time to make what it shows the very bytes of a query: nearest first, one a tick.
+            inexact = [row for row in np.argsort(away, kind="stable").tolist() if not sectors[row].exact]
+            if inexact:
+                row = inexact[0]
+                sectors[row].relight(self._relighter, light, 0)
+                sectors[row].settle(self._relighter, light)
+                report.settled = (indices[row],)
+
+    def _changes(self, sectors: list[LiveSector], light: LiveLight) -> Float64:
+        """(n,): how far each sector is from its light: its bounces' own distance, and what the light has changed by since."""
+        own = np.array([sector.change for sector in sectors])
+        lit = [row for row, sector in enumerate(sectors) if sector.lit_by is not None]
+        if lit:
+            vectors = [sectors[row].lit_by for row in lit]
+            numbers = np.array([v.numbers for v in vectors if v is not None])
+            scales = np.array([v.scale for v in vectors if v is not None])
+            moved = relative_changes(numbers, scales, light.vector)
+            own[lit] = np.maximum(own[lit], moved)
+            for row, change in zip(lit, moved.tolist(), strict=True):
+                if change > 0:
+                    sectors[row].exact = False
+        if light.standing:
+            # What still stands below the threshold is settled exactly, later.
+            return own
+        return np.where(own > SETTLED_CHANGE, own, 0.0)
+
+    def _fill(self, tick: int, players: TickPlayers, light: LiveLight, report: TickReport, until: float) -> None:
+        residents = self.streamer.residents
+        for gone in set(self.volumes) - set(players.ids):
+            del self.volumes[gone]
+        stale = []
+        for name, position in zip(players.ids, players.positions, strict=True):
+            volume = self.volumes.get(name)
+            if volume is None:
+                volume = self.volumes[name] = LiveVolume(self._device)
+            if volume.is_stale(position, residents, self._known):
+                if volume.wanted_since < 0:
+                    volume.wanted_since = tick
+                stale.append((volume.wanted_since, name, volume))
+        filled: list[str] = []
+        for _, name, volume in sorted(stale, key=lambda entry: entry[:2]):
+            if filled and time.perf_counter() >= until:
+                break
+            volume.fill(tick, residents, self._known, lambda sector: self._shown(sector, light), self._placeholder)
+            filled.append(name)
+        report.filled, report.waiting = tuple(filled), len(stale) - len(filled)
+
+    def _shown(self, sector: LiveSector, light: LiveLight) -> cl.Buffer:
+        return sector.shown(light.settings, lambda: self._placeholder(sector.resident.sector.index))
+
+    def _placeholder(self, index: SectorIndex) -> Float32:
+        """(6, 3) [lx]: the distant probe that stands in for a sector (slide "Distant shading")."""
+        texels = self._distant_sky
+        assert self._light is not None
+        sky = texels.sky[index.z - texels.origin.z, index.x - texels.origin.x]
+        return np.asarray(sky[:, None] * self._light.distant, np.float32)

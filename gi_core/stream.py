@@ -1,0 +1,128 @@
+"""Carries out streaming plans: sectors are read, checked and put on the device by threads of their own, and handed over when ready."""
+
+import logging
+import queue
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from gi_core.arrays import Float64
+from gi_core.dataset import SectorFacts, WorldInfo
+from gi_core.grid import SectorIndex
+from gi_core.live_sector import LiveSector
+from gi_core.sector import Sector
+from gi_core.stream_need import SectorTable
+from gi_core.stream_plan import StreamOptions, StreamPlan, StreamState, plan_streaming, retry_delay_s
+
+log = logging.getLogger("sectorlight.stream")
+
+# Threads that load. Decoding holds Python's lock half of the time: more of them would take it from the ticks.
+LOADERS = 1
+# Bytes on the device of one item, and a little for what is not counted: see ResidentSector and SunSamples.
+_BYTES_PER = {"probes": 256, "factors": 40, "bricks": 64, "surfels": 112, "voxels": 32}
+_BYTES_PER_SECTOR = 1 << 15
+
+
+def device_bytes(facts: SectorFacts, sun_planes: int, voxel_probes: int) -> int:
+    """What a sector takes on the device at most, from what the index says of it: with sun, snow, lamps and samples."""
+    counted = sum(size * int(getattr(facts, name)) for name, size in _BYTES_PER.items())
+    return _BYTES_PER_SECTOR + counted + facts.surfels * sun_planes // 8 + 6 * facts.voxels * voxel_probes
+
+
+def sector_table(world: WorldInfo) -> SectorTable:
+    """The world's sectors for streaming plans."""
+    planes, blended = world.sun_table.plane_count, int(world.settings.get("voxel_probes", 4))
+    return SectorTable.of({index: device_bytes(facts, planes, blended) for index, facts in world.sectors.items()})
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A sector that could not be loaded: how often in a row, when it is tried again, and why."""
+
+    attempts: int
+    retry_at_s: float
+    reason: str
+
+
+class Streamer:
+    """The sectors that are resident. ``residents`` is the ticker's: loaders only hand over what is whole."""
+
+    def __init__(
+        self, table: SectorTable, load: Callable[[SectorIndex], Sector], place: Callable[[Sector], LiveSector], options: StreamOptions
+    ) -> None:
+        """``load`` reads a sector (``Dataset.sector``), ``place`` puts it on the device; both are called by loaders' threads."""
+        self.residents: dict[SectorIndex, LiveSector] = {}
+        self.failures: dict[SectorIndex, Failure] = {}
+        self.loads = self.misses = 0
+        self._table, self._load, self._place, self._options = table, load, place, options
+        self._row = {index: row for row, index in enumerate(table.sectors)}
+        self._state = StreamState.empty(table)
+        self._loading: set[SectorIndex] = set()
+        self._done: queue.SimpleQueue[tuple[SectorIndex, LiveSector | Exception]] = queue.SimpleQueue()
+        self._loaders = ThreadPoolExecutor(LOADERS, thread_name_prefix="sector-loader")
+
+    @property
+    def loading(self) -> int:
+        """How many sectors are on their way."""
+        return len(self._loading)
+
+    @property
+    def resident_bytes(self) -> int:
+        """Bytes on the device, as the plan counts them."""
+        return int(self._state.resident_bytes.sum())
+
+    def take_over(self) -> list[SectorIndex]:
+        """Make resident what loaders have finished; those sectors. Failures are noted, to be tried again later."""
+        arrived: list[SectorIndex] = []
+        while True:
+            try:
+                index, found = self._done.get_nowait()
+            except queue.Empty:
+                return arrived
+            row = self._row[index]
+            self._loading.discard(index)
+            self._state.loading[row] = False
+            if isinstance(found, LiveSector):
+                self.residents[index] = found
+                self._state.resident_bytes[row] = max(found.nbytes, int(self._table.bytes[row]))
+                self._state.retry_at_s[row] = 0.0
+                self.failures.pop(index, None)
+                self.loads += 1
+                arrived.append(index)
+            else:
+                attempts = self.failures[index].attempts + 1 if index in self.failures else 1
+                retry_at_s = time.monotonic() + retry_delay_s(attempts)
+                self._state.retry_at_s[row] = retry_at_s
+                self.failures[index] = Failure(attempts, retry_at_s, str(found))
+                log.error("%s", found)
+
+    def step(self, positions: Float64, velocities: Float64) -> StreamPlan:
+        """Plan for players at positions (p, 3) [m] with velocities (p, 3) [m/s], evict and start to load."""
+        plan = plan_streaming(self._table, self._state, positions, velocities, now_s=time.monotonic(), options=self._options)
+        for index in plan.evictions:
+            del self.residents[index]
+            self._state.resident_bytes[self._row[index]] = 0
+        for index in plan.loads:
+            self._loading.add(index)
+            self._state.loading[self._row[index]] = True
+            self._loaders.submit(self._bring, index)
+        self.misses += len(plan.missing)
+        return plan
+
+    def resident_rows(self) -> "np.ndarray[tuple[int], np.dtype[np.int64]]":
+        """Rows of the table that are resident, in the order of ``residents``."""
+        return np.array([self._row[index] for index in self.residents], np.int64)
+
+    def close(self) -> None:
+        """Stop loading; waits for what is under way."""
+        self._loaders.shutdown(cancel_futures=True)
+
+    def _bring(self, index: SectorIndex) -> None:
+        try:
+            found: LiveSector | Exception = self._place(self._load(index))
+        except Exception as error:  # whatever it is, the world goes on without this sector
+            found = error
+        self._done.put((index, found))
