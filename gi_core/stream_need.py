@@ -23,6 +23,8 @@ _KEY_STRIDE = 1 << 32
 _WALKING_M_S = 1.5
 # Slower than this [m/s] a velocity divides like this one: it gets nowhere within any look-ahead.
 _STANDING_M_S = 1e-6
+# Below any time: what a volume reads is needed now.
+_TOUCHED = -1.0
 # Larger rectangles around a world are not held in memory; its sectors are searched instead, at ten times the cost.
 _MOST_GRID_CELLS = 1 << 22
 # Players are told apart by how many sectors they reach: up to this many beyond the first, twice as many, and so on.
@@ -92,28 +94,17 @@ def sector_needs(
     table: SectorTable, positions: Float64, velocities: Float64, *, look_ahead_s: float, load_margin_m: float, keep_margin_m: float
 ) -> Needs:
     """What players at finite positions (p, 3) [m] with velocities (p, 3) [m/s] need of a world."""
-    count = len(table.sectors)
     # The last row gathers what players would need of sectors that are not there.
-    needs = Needs(np.zeros(count + 1, bool), *(np.full(count + 1, np.inf) for _ in range(3)))
+    count = len(table.sectors)
+    ahead, keep, away = np.full((3, count + 1), np.inf)
     if count:
-        reach = _HALF_VOLUME_M + keep_margin_m + np.abs(velocities) * look_ahead_s
-        first, last = (np.floor((positions + side * reach) / SECTOR_SIZE_M).astype(np.int64) for side in (-1, 1))
-        speed = np.maximum(np.hypot(velocities[:, 0], velocities[:, 2]), _WALKING_M_S)
+        at, velocity = (np.ascontiguousarray(vectors[:, [0, 2]].T, np.float64) for vectors in (positions, velocities))
+        reach = _HALF_VOLUME_M + keep_margin_m + np.abs(velocity) * look_ahead_s
+        first, last = (np.floor((at + side * reach) / SECTOR_SIZE_M).astype(np.int64) for side in (-1, 1))
         for group in _of_like_reach(last - first):
-            x, z = (
-                _Axis.of(
-                    positions[group, axis],
-                    velocities[group, axis],
-                    speed[group],
-                    first[group, axis],
-                    last[group, axis],
-                    _HALF_VOLUME_M + load_margin_m,
-                    look_ahead_s,
-                )
-                for axis in (0, 2)
-            )
-            _gather(needs, table, x, z)
-    return Needs(needs.touched[:-1], needs.ahead_s[:-1], needs.keep_s[:-1], needs.away_m[:-1])
+            axes = _Axes.of(at[:, group], velocity[:, group], first[:, group], last[:, group], _HALF_VOLUME_M + load_margin_m, look_ahead_s)
+            _gather((ahead, keep, away), table, axes)
+    return Needs(keep[:-1] == _TOUCHED, ahead[:-1], np.maximum(keep[:-1], 0.0), away[:-1])
 
 
 def distance_m(places: Int64, positions: Float64) -> Float64:
@@ -148,66 +139,65 @@ def _grid_of(places: Int64) -> Int64 | None:
 
 
 def _of_like_reach(more: Int64) -> list[Int64 | slice]:
-    """Players, grouped so that one who drives does not make all others look as far; more (p, 3): sectors beyond the first."""
-    if len(more) == 0:
+    """Players, grouped so that one who drives does not make all others look as far; more (2, p): sectors beyond the first."""
+    players = more.shape[1]
+    if players == 0:
         return []
-    if len(more) * int(more[:, 0].max() + 1) * int(more[:, 2].max() + 1) <= _FEW_PAIRS:
+    if more.max() <= _SLOW_REACH or players * int(more.max() + 1) ** 2 <= _FEW_PAIRS:
         return [slice(None)]
     size = np.ceil(np.log2(np.maximum(more / _SLOW_REACH, 1.0))).astype(np.int64)
-    kind = size[:, 0] * _KINDS + size[:, 2]
+    kind = size[0] * _KINDS + size[1]
     return [np.flatnonzero(kind == k) for k in np.unique(kind)]
 
 
 @dataclass(frozen=True, eq=False)
-class _Axis:
-    """Along one axis, of each of the sectors within reach and each player, (k, p). Of two axes the worse one counts.
+class _Axes:
+    """Along x and z, of each of the sectors within reach and each player, (2, k, p). Of the two axes the worse one counts.
 
-    sector : its coordinate; within : whether the volume reads it; away : how far off it is [m]
-    keep : how long the volume takes to it at the player's speed [s]
+    sector : its coordinate; away : how far off it is [m]
+    keep : how long the volume takes to it at the player's speed [s]; _TOUCHED where the volume reads it
     enter, leave : when the volume with its load margin meets it, 0 at the earliest, and leaves it, the look-ahead at the latest [s]
     """
 
     sector: Int64
-    within: Bool
     away: Float64
     keep: Float64
     enter: Float64
     leave: Float64
 
     @classmethod
-    def of(cls, at: Float64, velocity: Float64, speed: Float64, first: Int64, last: Int64, half_m: float, look_ahead_s: float) -> "_Axis":
-        sector = np.minimum(first + np.arange(int((last - first).max()) + 1)[:, None], last)
-        low = sector * SECTOR_SIZE_M - at
+    def of(cls, at: Float64, velocity: Float64, first: Int64, last: Int64, half_m: float, look_ahead_s: float) -> "_Axes":
+        sector = np.minimum(first[:, None] + np.arange(int((last - first).max()) + 1)[:, None], last[:, None])
+        low = sector * SECTOR_SIZE_M - at[:, None]
         high = low + SECTOR_SIZE_M
-        volume_first, volume_last = _volume_sectors(at)
-        within = (sector >= volume_first) & (sector <= volume_last)
         away = np.maximum(np.maximum(low, -high), 0.0)
-        keep = np.maximum(away - _HALF_VOLUME_M, 0.0) / speed
-        keep[within] = 0.0
-        velocity = np.where(np.abs(velocity) < _STANDING_M_S, _STANDING_M_S, velocity)
+        keep = np.maximum(away - _HALF_VOLUME_M, 0.0) / np.maximum(np.hypot(*velocity), _WALKING_M_S)
+        volume_first, volume_last = _volume_sectors(at)
+        np.putmask(keep, (sector >= volume_first[:, None]) & (sector <= volume_last[:, None]), _TOUCHED)
+        velocity = np.where(np.abs(velocity) < _STANDING_M_S, _STANDING_M_S, velocity)[:, None]
         a, b = (low - half_m) / velocity, (high + half_m) / velocity
-        return cls(sector, within, away, keep, np.maximum(np.minimum(a, b), 0.0), np.minimum(np.maximum(a, b), look_ahead_s))
+        return cls(sector, away, keep, np.maximum(np.minimum(a, b), 0.0), np.minimum(np.maximum(a, b), look_ahead_s))
 
 
-def _gather(needs: Needs, table: SectorTable, x: _Axis, z: _Axis) -> None:
-    """Add a group of players' needs. What two axes say of a sector together is (kx, kz, p): players last, since they are many."""
+def _gather(least: tuple[Float64, Float64, Float64], table: SectorTable, axes: _Axes) -> None:
+    """Take a group of players' needs into the least (ahead, keep, away) of all.
 
-    def across(along_x: AnyArray, along_z: AnyArray) -> tuple[AnyArray, AnyArray]:
-        return along_x[:, None], along_z[None]
+    What two axes say of a sector together is (k, k, p): players last, since they are many.
+    """
 
-    row = table.rows(*across(x.sector, z.sector)).reshape(-1)
-    touched = np.logical_and(*across(x.within, z.within)).reshape(-1)
-    ahead = np.maximum(*across(x.enter, z.enter))
-    ahead[ahead > np.minimum(*across(x.leave, z.leave))] = np.inf
-    keep = np.minimum(np.maximum(*across(x.keep, z.keep)), ahead)
-    away = np.maximum(*across(x.away, z.away))
-    needs.touched[row[touched]] = True
-    for target, values in ((needs.ahead_s, ahead), (needs.keep_s, keep), (needs.away_m, away)):
+    def across(values: AnyArray) -> tuple[AnyArray, AnyArray]:
+        return values[0][:, None], values[1][None]
+
+    row = table.rows(*across(axes.sector)).reshape(-1)
+    ahead = np.maximum(*across(axes.enter))
+    np.putmask(ahead, ahead > np.minimum(*across(axes.leave)), np.inf)
+    keep = np.minimum(np.maximum(*across(axes.keep)), ahead)
+    for target, values in zip(least, (ahead, keep, np.maximum(*across(axes.away))), strict=True):
         np.minimum.at(target, row, values.reshape(-1))
 
 
 def _volume_sectors(at: Float64) -> tuple[Int64, Int64]:
-    """First and last sector along an axis that the volume at (p,) [m] reads, as volume.plan_boxes has it."""
+    """First and last sector along each axis that the volume at (2, p) [m] reads, as volume.plan_boxes has it."""
     voxels = VOLUME_SHAPE[1]
     first_voxel = np.round(at / VOXEL_SIZE_M) - voxels // 2
     first, last = (np.floor((first_voxel + k + 0.5) * VOXEL_SIZE_M / SECTOR_SIZE_M).astype(np.int64) for k in (0, voxels - 1))

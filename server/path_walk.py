@@ -8,7 +8,7 @@ is a binary search, so a time that is years away costs what the next one does.
 import math
 from bisect import bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,8 +21,7 @@ _SAME_PLACE_M = 1e-3
 _CORNER_DEGREES = 10.0
 
 
-@dataclass(frozen=True)
-class Pose:
+class Pose(NamedTuple):
     """position (x, y, z) [m]; velocity [m/s]; heading_degrees 0..360, 0 looks along -Z, 90 along +X, and goes on when one stands."""
 
     position: Point

@@ -117,6 +117,7 @@ def test_needs_are_the_same_however_players_are_grouped_and_sectors_found(
     whole = sector_needs(table, positions, velocities, **MARGINS)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(stream_need, "_FEW_PAIRS", 0)
+        patch.setattr(stream_need, "_SLOW_REACH", 1)
         patch.setattr(stream_need, "_MOST_GRID_CELLS", 0)
         searched = sector_needs(make_table(seed), positions, velocities, **MARGINS)
     for name in ("touched", "ahead_s", "keep_s", "away_m"):
