@@ -21,6 +21,8 @@ from gi_core.world import Location
 SHORTEST_STEP_S = 20.0
 # Real time that one step lasts at least: as often as one core makes a snapshot, with much to spare.
 STEP_REAL_S = 0.5
+# Blends within a step: a third of a second of a clock that runs at 1 x, in which the sky changes by less than any eye or file sees.
+BLENDS_PER_STEP = 64
 _EPOCH = datetime(2000, 1, 1, tzinfo=UTC)
 
 WeatherAt = Callable[[datetime], Weather]
@@ -36,12 +38,13 @@ class LightTrack:
         self._step_s = SHORTEST_STEP_S
         self._made: dict[int, Future[Lighting]] = {}
         self._standing: tuple[datetime, Lighting] | None = None
+        self._blended: tuple[tuple[int, int], Lighting] | None = None
 
     def set_weather(self, weather_at: WeatherAt) -> None:
         """The weather from now on, a function of the moment; the next ``at`` shows it."""
         self._weather_at = weather_at
         self._made.clear()
-        self._standing = None
+        self._standing = self._blended = None
 
     def at(self, moment: datetime, rate: float) -> Lighting:
         """The light at an aware moment while the clock runs at ``rate`` x real time (0: it stands).
@@ -59,6 +62,7 @@ class LightTrack:
         if step_s != self._step_s:
             self._step_s = step_s
             self._made.clear()
+            self._blended = None
         steps = (moment - _EPOCH).total_seconds() / step_s
         here = math.floor(steps)
         for number in (here, here + 1, here + 2):
@@ -66,8 +70,11 @@ class LightTrack:
                 self._made[number] = self._worker.submit(self._make, number, step_s, self._weather_at)
         for number in [n for n in self._made if not here <= n <= here + 2]:
             del self._made[number]
-        first, second = self._made[here].result(), self._made[here + 1].result()
-        return between_lightings(first, second, steps - here, moment.isoformat())
+        part = math.floor((steps - here) * BLENDS_PER_STEP)
+        if self._blended is None or self._blended[0] != (here, part):
+            first, second = self._made[here].result(), self._made[here + 1].result()
+            self._blended = (here, part), between_lightings(first, second, part / BLENDS_PER_STEP, moment.isoformat())
+        return self._blended[1]
 
     def _make(self, number: int, step_s: float, weather_at: WeatherAt) -> Lighting:
         moment = _EPOCH + timedelta(seconds=number * step_s)

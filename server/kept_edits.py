@@ -1,0 +1,72 @@
+"""Live edits that asked to be kept: players and lamps in a JSON file, written whole after each change, read at the next start."""
+
+import json
+import threading
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from gi_core.container import write_atomic
+from gi_core.errors import InputError
+from server.json_input import Members, read_text
+from server.lamps_json import lamp_from_json, lamp_to_json
+from server.live_state import LiveLamp, LiveState
+from server.player_paths import EyeHeight
+from server.players import Player, player_from_json
+
+MAX_FILE_BYTES = 1 << 26
+
+
+@dataclass(frozen=True)
+class Kept:
+    """What a state file holds."""
+
+    players: tuple[Player, ...] = ()
+    lamps: tuple[LiveLamp, ...] = ()
+
+
+class KeptEdits:
+    """Writes the state file. Safe to use from several threads."""
+
+    def __init__(self, path: Path | None) -> None:
+        self._path = path
+        self._lock = threading.Lock()
+
+    def expect_possible(self) -> None:
+        """Raise InputError when there is no file to keep anything in."""
+        if self._path is None:
+            raise InputError("keep: expected a server that was started with --state FILE, found none; leave keep out")
+
+    def save(self, state: LiveState) -> None:
+        """Write what of a state is to be kept, whole or not at all. Nothing without a file. Raises OSError."""
+        if self._path is None:
+            return
+        record = {
+            "players": [entry.player.to_json() for entry in state.players.values() if entry.kept],
+            "lights": [lamp_to_json(lamp) for lamp in state.lamps.values() if lamp.kept],
+        }
+        with self._lock:
+            write_atomic(self._path, (json.dumps(record, indent=1, allow_nan=False) + "\n").encode())
+
+
+def load_kept(path: Path | None, eye_height: EyeHeight | None) -> Kept:
+    """What a state file holds; nothing when there is none yet. Raises InputError for one that is not what ``save`` wrote."""
+    if path is None or not path.exists():
+        return Kept()
+    try:
+        record = json.loads(read_text(path, MAX_FILE_BYTES))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: expected JSON that a server wrote ({str(error)[:200]})") from error
+    members = Members(record, str(path), ("players", "lights"))
+    players = tuple(
+        player_from_json(entry, f"{path}: player {i}", eye_height=eye_height) for i, entry in enumerate(_list(members, "players"))
+    )
+    lamps = tuple(lamp_from_json(entry, f"{path}: light {i}") for i, entry in enumerate(_list(members, "lights")))
+    return Kept(players, lamps)
+
+
+def _list(members: Members, name: str) -> Iterable[object]:
+    value = members.value(name)
+    if not isinstance(value, list):
+        raise InputError(f"{members.where}: {name}: expected a list")
+    return value

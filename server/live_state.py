@@ -1,0 +1,136 @@
+"""What the live world is told to be: clock, weather, settings, lamps, players. Immutable; commands make another state of it.
+
+Requests don't change the world: they hand in commands, which the ticker applies in order between two ticks. So a tick sees one state,
+and a command either takes effect whole, from the tick that its reply names, or not at all.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import Any
+
+from gi_core.errors import InputError, SectorlightError
+from gi_core.settings import NEUTRAL, Settings
+from gi_core.shadow_plan import MovingBox
+from gi_core.world import Lamp
+from server.live_weather import WeatherSource
+from server.path_walk import PathWalk
+from server.players import MAX_PLAYERS, Player
+from server.world_clock import WorldClock
+
+MAX_LAMPS = 20_000
+
+
+class NoSuchThingError(InputError, LookupError):
+    """A player or a lamp that is not there: HTTP 404."""
+
+    code = "no_such_id"
+
+
+class TakenIdError(InputError):
+    """An id that is in use: HTTP 409."""
+
+    code = "id_taken"
+
+
+class LiveUnavailableError(SectorlightError, RuntimeError):
+    """The live world cannot answer now: HTTP 503."""
+
+    code = "live_unavailable"
+
+
+@dataclass(frozen=True)
+class LiveLamp:
+    """A lamp of the live world.
+
+    dynamic : evaluated apart, so that it can move every tick; kept : written to the state file, and back after a restart
+    """
+
+    id: str
+    lamp: Lamp
+    dynamic: bool = False
+    kept: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class LivePlayer:
+    """A simulated player and the walk it is on since a tick."""
+
+    player: Player
+    walk: PathWalk
+    since_tick: int
+    kept: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class LiveState:
+    """The world as it is told to be at a tick. ``jumps`` counts what made light or players jump on purpose."""
+
+    clock: WorldClock
+    weather: WeatherSource
+    settings: Settings = NEUTRAL
+    lamps: Mapping[str, LiveLamp] = field(default_factory=lambda: MappingProxyType({}))
+    players: Mapping[str, LivePlayer] = field(default_factory=lambda: MappingProxyType({}))
+    boxes: tuple[MovingBox, ...] = ()
+    jumps: int = 0
+
+    def with_player(self, added: LivePlayer) -> "LiveState":
+        """Another player. Raises TakenIdError, and InputError when there are too many."""
+        if added.player.id in self.players:
+            raise TakenIdError(f"player {added.player.id!r}: expected a new id, found one in use; delete that player first")
+        if len(self.players) >= MAX_PLAYERS:
+            raise InputError(f"players: expected at most {MAX_PLAYERS}, found as many already")
+        return replace(self, players=MappingProxyType({**self.players, added.player.id: added}))
+
+    def without_player(self, name: str) -> "LiveState":
+        """One player less. Raises NoSuchThingError."""
+        return replace(self, players=_without(self.players, name, "player"))
+
+    def with_lamp(self, lamp: LiveLamp, new: bool) -> "LiveState":
+        """Another lamp, or one changed. Raises TakenIdError, NoSuchThingError, and InputError when there are too many."""
+        if new and lamp.id in self.lamps:
+            raise TakenIdError(f"light {lamp.id!r}: expected a new id, found one in use; PATCH changes a light")
+        if not new and lamp.id not in self.lamps:
+            raise _missing(lamp.id, "light")
+        if len(self.lamps) >= MAX_LAMPS and new:
+            raise InputError(f"lights: expected at most {MAX_LAMPS}, found as many already")
+        return replace(self, lamps=MappingProxyType({**self.lamps, lamp.id: lamp}))
+
+    def without_lamp(self, name: str) -> "LiveState":
+        """One lamp less. Raises NoSuchThingError."""
+        return replace(self, lamps=_without(self.lamps, name, "light"))
+
+    def lamp(self, name: str) -> LiveLamp:
+        """A lamp by its id. Raises NoSuchThingError."""
+        if name not in self.lamps:
+            raise _missing(name, "light")
+        return self.lamps[name]
+
+    def player(self, name: str) -> LivePlayer:
+        """A player by its id. Raises NoSuchThingError."""
+        if name not in self.players:
+            raise _missing(name, "player")
+        return self.players[name]
+
+
+# From the state before a tick, and its number, to the state in that tick.
+Command = Callable[[LiveState, int], LiveState]
+
+
+def authored_lamps(lamps: tuple[Lamp, ...]) -> Mapping[str, LiveLamp]:
+    """The dataset's lamps under ids: their names where those are there and distinct, else their numbers."""
+    found: dict[str, LiveLamp] = {}
+    for number, lamp in enumerate(lamps):
+        name = lamp.name if lamp.name and lamp.name not in found else f"lamp-{number}"
+        found[name] = LiveLamp(name, lamp)
+    return MappingProxyType(found)
+
+
+def _without(things: Mapping[str, Any], name: str, what: str) -> Mapping[str, Any]:
+    if name not in things:
+        raise _missing(name, what)
+    return MappingProxyType({key: value for key, value in things.items() if key != name})
+
+
+def _missing(name: str, what: str) -> NoSuchThingError:
+    return NoSuchThingError(f"{what} {name[:64]!r}: expected the id of a {what} that is there, found none")

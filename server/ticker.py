@@ -1,0 +1,248 @@
+"""The live world's heartbeat: one thread, a fixed rate, never two ticks at once.
+
+Tick n is due at start + n / rate, whatever the ticks before took: nothing drifts. A tick that is late begins at once; one whose
+successor is already due is skipped, and its number with it, so that the world's clock stays true to real time. What is left out under
+load, in this order: details for /v1/live, which are made when asked for; volumes, which wait for later ticks, those that waited longest
+first. Streaming and relighting are never left out.
+"""
+
+import logging
+import queue
+import threading
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+
+from gi_core.errors import UnknownTimeError
+from gi_core.light_blend import LightVector
+from gi_core.light_track import LightTrack
+from gi_core.lighting import Lighting
+from gi_core.lights import lamps_on
+from gi_core.live_sector import LiveLight
+from gi_core.live_world import LiveWorld, TickPlayers, TickReport
+from gi_core.relight_input import relight_input
+from gi_core.settings import Settings
+from gi_core.world import Lamp
+from server.live_state import Command, LivePlayer, LiveState, LiveUnavailableError
+from server.tick_stats import TickStats
+
+log = logging.getLogger("sectorlight.ticker")
+
+# Of a tick's time; then volumes wait for the next.
+FILL_UNTIL = 0.6
+
+Listener = Callable[[TickReport], None]
+
+
+class Ticker:
+    """Runs a live world. Commands may come from any thread; ``state`` and ``stats`` may be read by any."""
+
+    def __init__(self, world: LiveWorld, state: LiveState) -> None:
+        self.world = world
+        self.state = state
+        self.stats = TickStats()
+        self.tick = -1
+        """The last tick that was begun; -1 before the first."""
+        self.lighting: Lighting | None = None
+        self.failure: str | None = None
+        """Why the world stands still, should it ever."""
+        self.listeners: list[Listener] = []
+        self._commands: queue.SimpleQueue[tuple[Command, Future[int]]] = queue.SimpleQueue()
+        self._stop = threading.Event()
+        self._worker: Executor = ThreadPoolExecutor(1, thread_name_prefix="lighting")
+        self._track = LightTrack(world.dataset.world.location, self._worker)
+        self._track.set_weather(state.weather.at)
+        self._light: LiveLight | None = None
+        self._light_of: tuple[object, ...] = ()
+        self._lit_lamps: tuple[object, ...] = ()
+        self._lamps_now: tuple[tuple[Lamp, ...], tuple[Lamp, ...]] = ((), ())
+        self._thread = threading.Thread(target=self._run, name="ticker", daemon=True)
+        self._running = threading.Event()
+
+    @property
+    def rate_hz(self) -> int:
+        """Ticks a second."""
+        return self.state.clock.ticks_per_second
+
+    @property
+    def is_running(self) -> bool:
+        """Whether ticks are being made: not before the kernels are warm."""
+        return self._running.is_set() and not self._stop.is_set()
+
+    def start(self) -> None:
+        """Begin; returns at once."""
+        self._thread.start()
+
+    def wait_until_running(self, timeout_s: float) -> bool:
+        """Whether the first tick has been made within some seconds."""
+        return self._running.wait(timeout_s)
+
+    def stop(self) -> None:
+        """Finish the tick that is under way, and end."""
+        self._stop.set()
+        if self._thread.is_alive():
+            self._thread.join()
+        self._refuse_commands()
+        self._worker.shutdown(cancel_futures=True)
+        self.world.close()
+
+    def apply(self, command: Command) -> "Future[int]":
+        """Have a command applied before the next tick; the future gives that tick's number, or raises what the command raised."""
+        done: Future[int] = Future()
+        self._commands.put((command, done))
+        if self._stop.is_set():
+            self._refuse_commands()
+        return done
+
+    def _run(self) -> None:
+        try:
+            started = time.perf_counter()
+            self.world.warm_up()
+            self._lighting_at(0)
+            log.info("kernels are warm after %.1f s", time.perf_counter() - started)
+        except Exception as error:
+            self.failure = str(error)
+            log.exception("the live world cannot start")
+            self._stop.set()
+            self._refuse_commands()
+            self._running.set()
+            return
+        period_s = 1 / self.rate_hz
+        start = time.perf_counter()
+        while not self._stop.is_set():
+            due = start + (self.tick + 1) * period_s
+            now = time.perf_counter()
+            if now < due:
+                self._stop.wait(due - now)
+                now = time.perf_counter()
+                if self._stop.is_set():
+                    break
+            number = self.tick + 1
+            overdue = int((now - due) / period_s)
+            if overdue > 0:
+                self.stats.skipped += overdue
+                number += overdue
+                due += overdue * period_s
+            self._tick(number, due, period_s)
+            self._running.set()
+
+    def _tick(self, number: int, due: float, period_s: float) -> None:
+        begun = time.perf_counter()
+        self.tick = number
+        try:
+            self._apply_commands(number)
+            light = self._light_at(number)
+            players = players_at(self.state.players, number, self.rate_hz)
+            lit = time.perf_counter()
+            left_ms = FILL_UNTIL * period_s * 1e3 - (lit - begun) * 1e3
+            report = self.world.tick(number, players, light, self.state.boxes, left_ms)
+            report.ms["light"] = (lit - begun) * 1e3
+        except Exception as error:
+            # The world goes on: the next tick may do what this one could not.
+            self.stats.failed_ticks += 1
+            if self.failure != str(error):
+                log.exception("tick %d failed", number)
+            self.failure = str(error)
+            return
+        self.failure = None
+        took_ms = (time.perf_counter() - begun) * 1e3
+        self.stats.add(report, took_ms, max(begun - due, 0.0) * 1e3, period_s * 1e3)
+        for listener in tuple(self.listeners):
+            listener(report)
+
+    def _apply_commands(self, number: int) -> None:
+        while True:
+            try:
+                command, done = self._commands.get_nowait()
+            except queue.Empty:
+                return
+            before = self.state
+            try:
+                self.state = command(before, number)
+            except Exception as error:
+                done.set_exception(error)
+                continue
+            self._note_changes(before, self.state)
+            done.set_result(number)
+
+    def _note_changes(self, before: LiveState, after: LiveState) -> None:
+        if after.weather is not before.weather:
+            self._track.set_weather(after.weather.at)
+        if after.lamps is not before.lamps:
+            changed = [
+                lamp.lamp
+                for name in before.lamps.keys() | after.lamps.keys()
+                for lamp in {before.lamps.get(name), after.lamps.get(name)} - {None}
+                if lamp is not None and before.lamps.get(name) != after.lamps.get(name)
+            ]
+            self.world.lamps_moved([(np.array(lamp.position), lamp.range_m) for lamp in changed])
+
+    def _lighting_at(self, number: int) -> Lighting:
+        clock = self.state.clock
+        last = clock.last_tick
+        if last is not None and number > last:  # the end of the years that have a sun
+            clock = clock.with_paused(last, True)
+            self.state = replace(self.state, clock=clock)
+        rate = 0.0 if clock.paused else clock.rate
+        return self._track.at(clock.moment_at(number), rate)
+
+    def _light_at(self, number: int) -> LiveLight:
+        try:
+            lighting = self._lighting_at(number)
+        except UnknownTimeError:
+            if self.lighting is None:
+                raise
+            lighting = self.lighting
+        state = self.state
+        key = (lighting, state.settings, state.lamps)
+        if self._light is None or any(a is not b for a, b in zip(key, self._light_of, strict=True)):
+            self.lighting = lighting
+            self._light = self._make_light(lighting, state)
+            self._light_of = key
+        return self._light
+
+    def _make_light(self, lighting: Lighting, state: LiveState) -> LiveLight:
+        settings = state.settings
+        gained = settings.light(lighting)
+        given = relight_input(gained, self.world.dataset.world.sun_table)
+        # Which lamps are on changes with the minute and with the sun: the same tuples otherwise, which sectors know at a glance.
+        key = (state.lamps, lighting.time[:16], bool(lighting.sun.direction[1] > 0), settings.lights_factor)
+        if key != self._lit_lamps:
+            self._lamps_now = lamps_now(state, lighting, settings, self._lamps_now)
+            self._lit_lamps = key
+        static, dynamic = self._lamps_now
+        standing = state.clock.paused or state.clock.rate == 0
+        return LiveLight(gained, given, LightVector.of(given), static, dynamic, settings, standing)
+
+    def _refuse_commands(self) -> None:
+        while True:
+            try:
+                _, done = self._commands.get_nowait()
+            except queue.Empty:
+                return
+            done.set_exception(LiveUnavailableError(f"the live world has stopped{': ' + self.failure if self.failure else ''}"))
+
+
+def lamps_now(
+    state: LiveState, lighting: Lighting, settings: Settings, before: tuple[tuple[Lamp, ...], tuple[Lamp, ...]]
+) -> tuple[tuple[Lamp, ...], tuple[Lamp, ...]]:
+    """Static and dynamic lamps that are on, their gain applied; the very tuples of ``before`` where nothing has changed."""
+
+    def group(dynamic: bool, was: tuple[Lamp, ...]) -> tuple[Lamp, ...]:
+        found = settings.brightened(lamps_on((entry.lamp for entry in state.lamps.values() if entry.dynamic is dynamic), lighting))
+        return was if found == was else found
+
+    return group(False, before[0]), group(True, before[1])
+
+
+def players_at(players: Mapping[str, LivePlayer], number: int, rate_hz: int) -> TickPlayers:
+    """Where players are at a tick."""
+    poses = [entry.walk.at((number - entry.since_tick) / rate_hz) for entry in players.values()]
+    return TickPlayers(
+        tuple(players),
+        np.array([pose.position for pose in poses], np.float64).reshape(-1, 3),
+        np.array([pose.velocity for pose in poses], np.float64).reshape(-1, 3),
+    )
