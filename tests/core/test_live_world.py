@@ -1,0 +1,283 @@
+"""The live world tick by tick: it settles to what a query gives, forgets what was, never pops, and lives with what cannot be loaded."""
+
+import shutil
+import time
+from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gi_core.dataset import Dataset, sector_path
+from gi_core.engine import Engine
+from gi_core.grid import SectorIndex
+from gi_core.light_blend import LightVector
+from gi_core.lighting import Lighting
+from gi_core.lights import lamps_on
+from gi_core.live_sector import FADE_TICKS, LiveLight
+from gi_core.live_world import LiveWorld, TickPlayers, TickReport
+from gi_core.relight_input import relight_input
+from gi_core.settings import NEUTRAL, Settings
+from gi_core.stream_plan import StreamOptions
+from gi_core.world import Lamp
+
+GOLDEN = Path(__file__).parents[1] / "golden" / "v1"
+STREET = np.array([5.0, 2.0, 30.0])  # its volume reads both sectors
+EAST = np.array([1.0, 0.0, 0.0])
+LATE_S = 30.0
+
+
+@pytest.fixture
+def engine() -> Engine:
+    """Without the dataset's lamps, some of which burn by day."""
+    made = Engine(Dataset.open(GOLDEN))
+    made.lamps = ()
+    return made
+
+
+@pytest.fixture
+def world():
+    made = LiveWorld(Dataset.open(GOLDEN), shadow_map=False)
+    yield made
+    made.close()
+
+
+def light_of(
+    world: LiveWorld, lighting: Lighting, lamps: tuple[Lamp, ...] = (), settings: Settings = NEUTRAL, standing: bool = True
+) -> LiveLight:
+    gained = settings.light(lighting)
+    given = relight_input(gained, world.dataset.world.sun_table)
+    on = settings.brightened(lamps_on(lamps, lighting))
+    return LiveLight(gained, given, LightVector.of(given), on, (), settings, standing)
+
+
+def at(*places: np.ndarray, velocity=(0.0, 0.0, 0.0)) -> TickPlayers:
+    positions = np.array(places, np.float64).reshape(-1, 3)
+    return TickPlayers(tuple(f"p{i}" for i in range(len(places))), positions, np.tile(np.array(velocity, np.float64), (len(places), 1)))
+
+
+class Run:
+    """Ticks of one world, numbered."""
+
+    def __init__(self, world: LiveWorld) -> None:
+        self.world, self.number = world, -1
+
+    def tick(self, players: TickPlayers, light: LiveLight) -> TickReport:
+        self.number += 1
+        return self.world.tick(self.number, players, light)
+
+    def until(self, players: TickPlayers, light: LiveLight, done) -> int:
+        """Ticks until something holds."""
+        before, deadline = self.number, time.monotonic() + LATE_S
+        while not done(self.tick(players, light)):
+            assert time.monotonic() < deadline, "it never came to hold"
+            time.sleep(0.001)
+        return self.number - before
+
+    def settle(self, players: TickPlayers, light: LiveLight) -> np.ndarray:
+        """The first player's volume once nothing moves any more."""
+
+        def settled(report: TickReport) -> bool:
+            residents = self.world.streamer.residents
+            loaded = residents and not self.world.streamer.loading and not report.missing
+            return bool(loaded and all(s.exact and not s.is_fading for s in residents.values()) and not report.filled)
+
+        self.until(players, light, settled)
+        return self.world.volumes[players.ids[0]].published.values
+
+
+@pytest.mark.parametrize("time_of_day", ["12:00", "23:30"])
+def test_a_world_that_stands_still_shows_the_very_bytes_of_a_query(world, engine, time_of_day):
+    lighting = engine.lighting(time_of_day, "clear")
+    engine.lamps = world.dataset.world.lamps
+    found = Run(world).settle(at(STREET), light_of(world, lighting, engine.lamps))
+    query = engine.volume(STREET, lighting)
+    np.testing.assert_array_equal(found, query.values)
+    np.testing.assert_array_equal(world.volumes["p0"].published.mask, query.mask)
+
+
+def test_light_on_and_off_again_gives_the_first_bytes_back(world, engine):
+    run, lighting = Run(world), engine.lighting("12:00", "clear")
+    before = run.settle(at(STREET), light_of(world, lighting))
+    lamp = Lamp("flare", "point", (5.0, 3.0, 30.0), 1e9)
+    world.lamps_moved([(np.array(lamp.position), lamp.range_m)])
+    lit = run.settle(at(STREET), light_of(world, lighting, (lamp,)))
+    assert lit.max() > 2 * before.max()
+    world.lamps_moved([(np.array(lamp.position), lamp.range_m)])
+    np.testing.assert_array_equal(run.settle(at(STREET), light_of(world, lighting)), before)
+
+
+def test_another_hour_and_back_gives_the_first_bytes_back(world, engine):
+    run, noon = Run(world), light_of(world, engine.lighting("12:00", "clear"))
+    before = run.settle(at(STREET), noon)
+    assert not np.array_equal(run.settle(at(STREET), light_of(world, engine.lighting("21:00", "snow"))), before)
+    np.testing.assert_array_equal(run.settle(at(STREET), noon), before)
+
+
+@pytest.mark.parametrize(
+    "settings", [Settings(bounce_factor=3.0), Settings(ambient_up=(10.0, 20.0, 30.0), interior_ambient_scale=2.0), Settings(sun_factor=0.2)]
+)
+def test_settings_show_what_a_query_under_them_gives(world, engine, settings):
+    lighting = engine.lighting("12:00", "clear")
+    found = Run(world).settle(at(STREET), light_of(world, lighting, settings=settings))
+    expected = engine.volume(STREET, lighting, settings).values
+    # The gains are applied by the device here and by NumPy there: one rounding more or less.
+    np.testing.assert_allclose(found, expected, rtol=3e-6, atol=3e-6 * expected.max())
+
+
+def test_an_idle_world_relights_and_fills_nothing(world, engine):
+    run, light = Run(world), light_of(world, engine.lighting("12:00", "clear"))
+    run.settle(at(STREET), light)
+    for _ in range(5):
+        report = run.tick(at(STREET), light)
+        assert (report.relit, report.settled, report.filled, report.passes) == ((), (), (), 0)
+
+
+def test_a_lamp_that_moves_is_followed_within_a_few_ticks(world, engine):
+    """Peers: 9 ticks until light is within 1e-3 of its fixed point."""
+    run, lighting = Run(world), engine.lighting("23:30", "clear")
+    lamp = Lamp("torch", "point", (10.0, 3.0, 20.0), 2000.0)
+    run.settle(at(STREET), light_of(world, lighting, (lamp,)))
+    moved = replace(lamp, position=(10.0, 3.0, 17.0))
+    engine.lamps = (moved,)
+    goal = engine.volume(STREET, lighting).values
+    world.lamps_moved([(np.array(lamp.position), lamp.range_m), (np.array(moved.position), moved.range_m)])
+    light = light_of(world, lighting, (moved,), standing=False)
+
+    def close(_: TickReport) -> bool:
+        return float(np.abs(world.volumes["p0"].published.values - goal).max()) <= 1e-3 * goal.max()
+
+    assert not close(TickReport(0))
+    assert run.until(at(STREET), light, close) <= 5
+
+
+def test_nothing_pops_when_a_sector_arrives_late(tmp_path, engine):
+    """It fades in from the distant probe that stood for it: no voxel moves by more than a share of the way in a tick."""
+    dataset = Dataset.open(GOLDEN)
+    slow = {"hold": True}
+
+    def late(index):
+        while slow["hold"] and index == SectorIndex(-1, 0):
+            time.sleep(0.005)
+        return Dataset.sector(dataset, index)
+
+    dataset.sector = late  # type: ignore[method-assign]
+    world = LiveWorld(dataset, shadow_map=False)
+    try:
+        run, light = Run(world), light_of(world, engine.lighting("12:00", "clear"))
+        # The other sector comes first only if it is asked for first.
+        run.until(at(STREET + EAST * 30), light, lambda r: SectorIndex(0, 0) in world.streamer.residents)
+        for _ in range(FADE_TICKS + 2):
+            run.tick(at(STREET), light)
+        before = world.volumes["p0"].published
+        assert before.missing == (SectorIndex(-1, 0),)
+        assert (before.values[:, :, :, :4] > 0).any()  # the placeholder, not darkness
+        slow["hold"] = False
+        frames = []
+
+        def arrived(report: TickReport) -> bool:
+            frames.append(world.volumes["p0"].published.values)
+            sector = world.streamer.residents.get(SectorIndex(-1, 0))
+            return sector is not None and sector.exact and not sector.is_fading and not report.filled
+
+        run.until(at(STREET), light, arrived)
+        whole_way = np.abs(frames[-1] - before.values)
+        largest = max(np.abs(b - a).max() for a, b in zip([before.values, *frames], frames, strict=False))
+        assert whole_way.max() > 0
+        # A step of the fade, and what the light itself still moves by while it settles.
+        assert largest <= 1.5 * whole_way.max() / FADE_TICKS
+    finally:
+        slow["hold"] = False
+        world.close()
+
+
+def test_a_sector_that_cannot_be_read_leaves_the_distant_probe_and_is_tried_again(tmp_path, engine):
+    city = tmp_path / "city"
+    shutil.copytree(GOLDEN, city)
+    file = sector_path(city, SectorIndex(-1, 0))
+    whole = file.read_bytes()
+    file.write_bytes(whole[:100])
+    world = LiveWorld(Dataset.open(city), shadow_map=False)
+    try:
+        run, light = Run(world), light_of(world, engine.lighting("12:00", "clear"))
+        run.until(at(STREET), light, lambda r: world.streamer.failures and world.volumes["p0"].published.sectors)
+        failure = world.streamer.failures[SectorIndex(-1, 0)]
+        assert failure.attempts == 1
+        assert "-1_0.gisec" in failure.reason
+        published = world.volumes["p0"].published
+        assert published.missing == (SectorIndex(-1, 0),)
+        assert np.isfinite(published.values).all()
+        file.write_bytes(whole)
+        run.until(at(STREET), light, lambda r: not r.missing)
+        assert world.streamer.failures == {}
+    finally:
+        world.close()
+
+
+def test_the_budget_holds_while_a_player_walks_to_and_fro(engine):
+    dataset = Dataset.open(GOLDEN)
+    world = LiveWorld(dataset, shadow_map=False)
+    largest = max(world.streamer._table.bytes.tolist())
+    world.close()
+    world = LiveWorld(dataset, shadow_map=False, stream=StreamOptions(int(1.5 * largest)))
+    try:
+        run, light = Run(world), light_of(world, engine.lighting("12:00", "clear"), standing=False)
+        for step in range(80):
+            x = 60.0 * np.sin(step / 10)
+            run.tick(at(np.array([x, 2.0, 30.0]), velocity=(60 * np.cos(step / 10) * 3, 0, 0)), light)
+            assert world.streamer.resident_bytes <= 1.5 * largest
+            time.sleep(0.004)
+        assert world.streamer.loads >= 1
+        assert np.isfinite(world.volumes["p0"].published.values).all()
+    finally:
+        world.close()
+
+
+def test_players_share_sectors_and_leave_nothing_behind(world, engine):
+    run, light = Run(world), light_of(world, engine.lighting("12:00", "clear"))
+    run.settle(at(STREET, STREET + EAST * 3.2, STREET), light)
+    assert len(world.streamer.residents) == 2
+    np.testing.assert_array_equal(world.volumes["p0"].published.values, world.volumes["p2"].published.values)
+    run.tick(at(STREET), light)
+    assert list(world.volumes) == ["p0"]
+
+
+def test_warming_up_changes_no_light(world, engine):
+    world.warm_up()
+    lighting = engine.lighting("12:00", "clear")
+    found = Run(world).settle(at(STREET), light_of(world, lighting))
+    np.testing.assert_array_equal(found, engine.volume(STREET, lighting).values)
+
+
+def test_a_shadow_map_is_drawn_around_players_and_used(engine):
+    world = LiveWorld(Dataset.open(GOLDEN))
+    try:
+        run, light = Run(world), light_of(world, engine.lighting("15:00", "clear"))
+        residents = world.streamer.residents
+        run.until(at(STREET), light, lambda r: len(residents) == 2 and all(s.sampled_in == 1 for s in residents.values()))
+        sampled = [sector.samples.read()[0] for sector in residents.values()]
+        assert all((sample != 255).mean() > 0.9 for sample in sampled)
+        by_day = run.settle(at(STREET), light)
+        # At night there is no sun whose shadows could be kept.
+        run.settle(at(STREET), light_of(world, engine.lighting("23:30", "clear")))
+        assert all(sector.samples is None for sector in residents.values())
+        run.until(at(STREET), light, lambda r: all(s.sampled_in == 2 for s in residents.values()))
+        np.testing.assert_array_equal(run.settle(at(STREET), light), by_day)
+    finally:
+        world.close()
+
+
+def test_a_running_clock_is_followed(world, engine):
+    run = Run(world)
+    run.settle(at(STREET), light_of(world, engine.lighting("08:00", "clear")))
+    changes = []
+    for minute in range(1, 30):
+        lighting = engine.lighting(datetime(2024, 6, 21, 8, minute).isoformat(), "clear")
+        light = light_of(world, lighting, standing=False)
+        run.tick(at(STREET), light)
+        run.tick(at(STREET), light)
+        expected = engine.volume(STREET, lighting).values
+        changes.append(np.abs(world.volumes["p0"].published.values - expected).max() / expected.max())
+    # A minute a tick is 1800 x: a relight behind, two of which make up a volume's two sectors.
+    assert np.median(changes) < 0.02
