@@ -92,7 +92,7 @@ def test_errors_are_counted_and_the_test_goes_on(standing_in: StandingIn, fault:
         assert not world.players
     assert report["errors"] >= 2
     assert any(text in message for message in report["error_messages"])
-    assert report["frames"] > 4
+    assert report["frames"] > 2  # more than the first of each player
 
 
 def test_late_ticks_and_misses_are_what_the_server_gained(standing_in: StandingIn) -> None:
