@@ -173,7 +173,7 @@ async def _watch_server(
     http: httpx.AsyncClient, watch: Watch, seconds: float, stop: asyncio.Event, progress: Progress, clients: list[asyncio.Task[None]]
 ) -> None:
     """Ask the server how it does until the time is up, ``stop`` is set, or a client broke, which none may."""
-    clock: tuple[float, float, float] | None = None
+    clock = await _ask_clock(http, watch, None)
     while (left := seconds - watch.now()) > 0 and not stop.is_set() and not any(client.done() for client in clients):
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(stop.wait(), min(POLL_S, left))

@@ -74,6 +74,9 @@ class VolumeEncoder:
     def encode(self, tick: int, values: Float32, mask: UInt8, first_voxel: Int64, time_us: int) -> bytes | None:
         """The message that brings the client to a volume, or None when all that changed is below the thresholds.
 
+        Call it at every tick, also when nothing changed: frames say how many ticks passed between two looks, and a client takes a gap for
+        ticks that it was not shown.
+
         Parameters
         ----------
         tick : greater than at the last call

@@ -46,7 +46,7 @@ def test_a_server_that_behaves(standing_in: StandingIn, mode: str) -> None:
     if mode == "stream":
         # A full frame at first, then a slab every SLAB_TICKS, and nothing else.
         assert report["full_frames"] == 3
-        assert 3 * (1 + 4) <= report["frames"] <= 3 * (1 + 10)
+        assert 3 * (1 + 2) <= report["frames"] <= 3 * (1 + 10)
         assert report["volume_ms_since"] == "the tick"
     else:
         assert report["frames"] > 3 * 10

@@ -143,6 +143,14 @@ def test_a_light_switched_on_and_off_leaves_no_trace():
         assert not both.decoder.values.any()
 
 
+def test_light_too_faint_for_any_scale_is_not_sent_for_ever():
+    both = Both()
+    values, mask = np.full((*SMALL.shape, 3), 1e-20, np.float32), np.ones(SMALL.shape[1:], np.uint8)
+    both.send(values, mask)
+    assert both.send(values, mask) is None
+    assert not both.decoder.values.any()
+
+
 def test_a_read_only_volume_is_not_looked_at_again_but_a_writeable_one_is():
     world, both = World(), Both()
     values, mask = world.volume((0, 0, 0))
