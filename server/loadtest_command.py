@@ -9,6 +9,7 @@ from urllib.parse import urlsplit
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
+from rich.text import Text
 
 from gi_core.container import write_atomic
 from gi_core.errors import InputError
@@ -103,9 +104,9 @@ def table_of(report: dict[str, Any]) -> Table:
         "this client's share of a core": _numbers(report["client_cpu_share"]),
     }
     for name, text in rows.items():
-        table.add_row(name, text)
+        table.add_row(Text(name), text)  # Text: brackets are units, not markup
     for text, count in report["error_messages"].items():
-        table.add_row(text, f"{count:,}", style="red")
+        table.add_row(Text(text), f"{count:,}", style="red")
     if report["client_cpu_share"] > BUSY_CLIENT:
         table.caption = "This client was busy all the time: its latencies are its own. Use fewer players, or several load tests."
     return table

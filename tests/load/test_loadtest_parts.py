@@ -7,6 +7,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+from rich.console import Console
 
 from gi_core.errors import InputError
 from server.loadtest_clients import count_pops, read_reply
@@ -92,6 +93,14 @@ def test_limits_name_what_was_missed() -> None:
     unknown = report_of(Recorder(), SETTING, 3.0, 0.5, False)
     assert all("not known" in line for line in missed(unknown, Limits(tick_p99_ms=1, late_share=1, misses=0)))
     assert len(list(missed(unknown, Limits(tick_p99_ms=1, late_share=1, misses=0)))) == 3
+
+
+def test_units_in_brackets_are_shown(capsys: pytest.CaptureFixture[str]) -> None:
+    report = some_report() | {"error_messages": {"found [/] there": 2}}
+    Console(width=120).print(table_of(report))
+    shown = capsys.readouterr().out
+    assert "p50 / p99 / max [ms]" in shown
+    assert "found [/] there" in shown
 
 
 def test_a_picture_and_a_table_of_any_report() -> None:
