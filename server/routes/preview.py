@@ -7,12 +7,14 @@ from fastapi import APIRouter, Query, Request, Response
 
 from gi_core.arrays import Float64
 from gi_core.lighting import Lighting
+from gi_core.lights import lamps_on
 from gi_core.volume import Volume
 from server import tonemap
 from server.caching import Body, conditional, strong_etag
+from server.camera import Camera
 from server.dependencies import PreviewQuery, ServiceDep, parse_vector
 from server.encoding import REPLY_VERSION
-from server.preview import Camera, render
+from server.preview import render
 from server.service import Service
 
 router = APIRouter(prefix="/v1", tags=["pictures"])
@@ -20,7 +22,7 @@ router = APIRouter(prefix="/v1", tags=["pictures"])
 
 @router.get("/preview.png", response_class=Response, responses={200: {"content": {"image/png": {}}}})
 def preview(request: Request, service: ServiceDep, query: Annotated[PreviewQuery, Query()]) -> Response:
-    """The city at a time and in a weather, lit directly by sun and moon and indirectly by the volumes that /v1/volume serves."""
+    """The city at a time and in a weather, lit directly by sun, moon and lamps, indirectly by the volumes that /v1/volume serves."""
     light = service.lighting(query.time, query.weather)
     etag = strong_etag("preview", REPLY_VERSION, service.light_identity, light.digest, query.model_dump(exclude={"time", "weather"}))
     return conditional(request, etag, lambda: Body(picture(service, query, light), "image/png"))
@@ -37,5 +39,5 @@ def picture(service: Service, query: PreviewQuery, light: Lighting) -> bytes:
 
     with service.preview_turn():
         scene = service.preview_scenes.around(camera.eye, camera.look)
-        radiance = render(camera, scene, light, volume_at, query.gi)
+        radiance = render(camera, scene, light, lamps_on(service.engine.lamps, light), volume_at, query.gi)
     return tonemap.png(radiance, light.exposure)
