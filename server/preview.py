@@ -16,7 +16,10 @@ import numpy as np
 
 from gi_core.arrays import Float32, Float64, Int32, Int64
 from gi_core.constants import VOLUME_SHAPE, VOXEL_SIZE_M
+from gi_core.engine import Engine
 from gi_core.lighting import Lighting
+from gi_core.lights import lamps_on
+from gi_core.settings import NEUTRAL, Settings
 from gi_core.snow import snow_attribute, whitened
 from gi_core.volume import Volume, sample_volume
 from gi_core.world import Lamp
@@ -37,6 +40,20 @@ TILE_M = (np.array([VOLUME_SHAPE[2], VOLUME_SHAPE[0], VOLUME_SHAPE[1]]) - 4) * V
 MAX_VOLUMES = 128
 # Sampling holds some 300 bytes a point: 20 MB.
 SAMPLES_AT_ONCE = 1 << 16
+
+
+def city_radiance(
+    engine: Engine, scene: PreviewScene, camera: Camera, lighting: Lighting, indirect: Indirect = "on", settings: Settings = NEUTRAL
+) -> Float32:
+    """``render`` with an engine's lamps and volumes, under the artists' settings. Raises CorruptFileError."""
+    low, high = engine.dataset.world.bounds
+
+    def volume_at(position: Float64) -> Volume:
+        # A tile's centre may lie beyond the world's edge though its pixels do not.
+        return engine.volume(np.clip(position, low, high), lighting, settings)
+
+    lamps = settings.brightened(lamps_on(engine.lamps, lighting))
+    return render(camera, scene, settings.light(lighting), lamps, volume_at, indirect)
 
 
 def render(

@@ -216,3 +216,6 @@ def test_the_meter_follows_lamps_but_never_opens_beyond_the_sky():
     assert tonemap.metered(gray, 0.0) == pytest.approx(np.log2(800), abs=1e-3)
     assert tonemap.metered(gray, 15.0) == 15.0
     assert tonemap.metered(np.zeros((4, 4, 3), np.float32), -3.0) == -3.0
+    under_black_sky = gray.copy()
+    under_black_sky[:2] = 1e-5
+    assert tonemap.metered(under_black_sky, 0.0) == pytest.approx(np.log2(800) - 3, abs=0.05)  # half the lightness
