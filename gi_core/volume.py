@@ -137,13 +137,16 @@ def sample_volume(values: Float32, origin: Float64, voxel_size: Float64, points:
     normals = np.asarray(normals, np.float32)
     texel, weight = _corners(values.shape[1:4], origin, voxel_size, points + 0.25 * voxel_size * normals)
     texels = values.reshape(-1, values.shape[4])
-    squared = normals * normals
     total = np.zeros((len(points), values.shape[4]), np.float32)
-    # Of the six faces a normal reads the three that it turns to: half the work of blending all and weighing them after.
+    # Of the six faces a normal reads those that it turns to, one where it follows an axis: most of a city's surfaces do.
     for axis in range(3):
-        first = np.where(normals[:, axis] >= 0, 2 * axis, 2 * axis + 1) * (len(texels) // 6)
+        turned = np.flatnonzero(normals[:, axis])
+        along = normals[turned, axis]
+        first = np.where(along >= 0, 2 * axis, 2 * axis + 1) * (len(texels) // 6)
+        face = np.zeros((len(turned), values.shape[4]), np.float32)
         for corner in range(8):
-            total += (weight[corner] * squared[:, axis])[:, None] * texels[first + texel[corner]]
+            face += weight[corner, turned, None] * texels.take(texel[corner, turned] + first, axis=0)
+        total[turned] += (along * along)[:, None] * face
     return total
 
 
@@ -161,13 +164,16 @@ def _corners(shape: tuple[int, ...], origin: Float64, voxel_size: Float64, point
     """The eight voxels around points (n, 3) [m] and what each weighs: row-major numbers (8, n) in (ny, nz, nx), and (8, n)."""
     ny, nz, nx = shape
     top = np.array([nx, ny, nz]) - 1
-    at = np.clip((points - origin) / voxel_size, 0, top)
-    low = np.minimum(at.astype(np.int64), np.maximum(top - 1, 0))
-    shares = np.stack([1 - (at - low), at - low]).T  # (3, n, 2)
-    number, weight = np.zeros((8, len(points)), np.int64), np.ones((8, len(points)), np.float32)
+    at = np.clip((points - origin) / voxel_size, 0, top).T
+    low = np.minimum(at.astype(np.int64), np.maximum(top - 1, 0)[:, None])
+    share = (at - low).astype(np.float32)
+    pairs = [(1 - s, s) for s in share]
+    first = (low[1] * nz + low[2]) * nx + low[0]
+    # A volume of one voxel along an axis has no second one; its share is 0.
+    step = np.minimum(top, 1) * (1, nz * nx, nx)
+    number, weight = np.empty((8, len(points)), np.int64), np.empty((8, len(points)), np.float32)
     for corner in range(8):
         offset = (corner & 1, corner >> 1 & 1, corner >> 2 & 1)
-        x, y, z = np.minimum(low + offset, top).T
-        number[corner] = (y * nz + z) * nx + x
-        weight[corner] = shares[0, :, offset[0]] * shares[1, :, offset[1]] * shares[2, :, offset[2]]
+        number[corner] = first + step @ offset
+        np.multiply(pairs[0][offset[0]] * pairs[1][offset[1]], pairs[2][offset[2]], out=weight[corner])
     return number, weight
