@@ -28,9 +28,10 @@ from bake_jobs.lamp_sampling import LampSampler
 from bake_jobs.rays import SURFACE_OFFSET_M, RayScene
 from bake_jobs.snow import snow_attribute
 from gi_core.arrays import AnyArray, Float32, Float64, Int32
-from gi_core.constants import SKY_SHAPE, SNOW_ALBEDO
+from gi_core.constants import SKY_SHAPE
 from gi_core.errors import InputError
 from gi_core.lighting import Lighting
+from gi_core.snow import whitened
 from gi_core.world import Lamp
 
 # About 2.5 MB a float32 triple array: big enough that NumPy's call overhead vanishes, small enough for the cache of one core.
@@ -234,8 +235,7 @@ class PathTracer:
         albedo = self._albedo[triangle]
         if snow == 0:
             return albedo
-        cover = np.float32(snow) * snow_attribute(self.rays, start, normal)
-        return albedo + cover[:, None] * (np.float32(SNOW_ALBEDO) - albedo)
+        return whitened(albedo, np.float32(snow) * snow_attribute(self.rays, start, normal))
 
 
 def sky_radiance(sky: Float32, directions: AnyArray) -> Float32:

@@ -131,4 +131,4 @@ def light_surfels(lights: AnyArray, places: AnyArray, triangles: list[AnyArray])
 
 
 def _dot(a: Float32, b: Float32) -> Float32:
-    return np.asarray((a * b).sum(axis=-1), np.float32)
+    return np.asarray(np.einsum("...i,...i->...", a, b), np.float32)

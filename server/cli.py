@@ -188,6 +188,26 @@ def compare(
 
 
 @app.command()
+def strip(
+    dataset: Annotated[Path, typer.Argument(help="A baked dataset's folder.")],
+    eye: Annotated[str, typer.Option(metavar="X,Y,Z", help="Where the camera is [m].")],
+    look: Annotated[str, typer.Option(metavar="X,Y,Z", help="What it looks at [m].")],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="OUT.png", help="The sheet.")],
+    kind: Annotated[str, typer.Option(help="day: 24 hours; weather: every preset; settings: every knob of the artists' panel.")] = "day",
+    time: Annotated[str, typer.Option(help="Of the weathers: local time.")] = "13:00",
+    weather: Annotated[str, typer.Option(help="Of the hours and the settings.")] = "clear",
+    fov: Annotated[float, typer.Option(min=1, max=150, help="Horizontal angle [degrees].")] = 75,
+    width: Annotated[int, typer.Option(min=16, max=960, help="Of one picture [pixels].")] = 240,
+    device: DeviceOption = None,
+) -> None:
+    """Draw one street in many lights, as one sheet of small labelled pictures."""
+    from server import strip as sheets
+
+    with writing(output):
+        sheets.run(dataset, sheets.camera_of(eye, look, fov, width), kind, time, weather, output, device)
+
+
+@app.command()
 def bench(
     json_path: Annotated[Path | None, typer.Option("--json", metavar="OUT", help="Write the measurements here.")] = None,
     device: DeviceOption = None,

@@ -13,7 +13,7 @@ ArrayFormat = Literal["npy", "raw"]
 RawEncoding = Literal["f16"]
 
 # Changes whenever the bytes of a reply change for the same data; part of every ETag.
-REPLY_VERSION = 1
+REPLY_VERSION = 2
 
 HALF_MAX = 65504.0
 MEDIA_TYPE: dict[ArrayFormat, str] = {"npy": "application/x-npy", "raw": "application/octet-stream"}

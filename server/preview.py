@@ -1,28 +1,38 @@
 """A picture of the lit city, drawn the way a client draws: direct light by shadow rays, indirect light from served volumes only.
 
-    camera rays -> surface -> direct sun and moon (shadow ray)
+    camera rays -> surface -> direct sun, moon and lamps (shadow rays)
                            -> indirect: the volume that covers the pixel, a quarter voxel off the surface
+                           -> albedo, whitened where snow lies
                 -> sky radiance, or a plain ground beyond the world's edge
+                -> fog before both, then the lamps themselves
 
 What a picture shows wrong is therefore wrong for clients as well.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from typing import Literal
 
 import numpy as np
 
-from gi_core.arrays import Float32, Float64, Int64
+from gi_core.arrays import Float32, Float64, Int32, Int64
 from gi_core.constants import VOLUME_SHAPE, VOXEL_SIZE_M
+from gi_core.engine import Engine
 from gi_core.lighting import Lighting
+from gi_core.lights import lamps_on
+from gi_core.settings import NEUTRAL, Settings
+from gi_core.snow import snow_attribute, whitened
 from gi_core.volume import Volume, sample_volume
+from gi_core.world import Lamp
+from server.camera import Camera
+from server.preview_air import background, plain_distance, through_fog
+from server.preview_lamps import draw_lamps, lamp_irradiance
 from server.preview_scene import PreviewScene
+from server.raycast import RayCaster
 
 Indirect = Literal["on", "off", "split"]
 VolumeAt = Callable[[Float64], Volume]
 
-ASPECT = 9 / 16
+STRAIGHT_UP = np.array([0.0, 1.0, 0.0])
 SAMPLE_OFFSET_M = VOXEL_SIZE_M / 4
 # Neighbouring volumes overlap by 4 voxels along each axis, so that every sample lies between voxel centres even after snapping.
 TILE_M = (np.array([VOLUME_SHAPE[2], VOLUME_SHAPE[0], VOLUME_SHAPE[1]]) - 4) * VOXEL_SIZE_M
@@ -30,58 +40,66 @@ TILE_M = (np.array([VOLUME_SHAPE[2], VOLUME_SHAPE[0], VOLUME_SHAPE[1]]) - 4) * V
 MAX_VOLUMES = 128
 # Sampling holds some 300 bytes a point: 20 MB.
 SAMPLES_AT_ONCE = 1 << 16
-# What lies beyond the world's edge is drawn as ground of this albedo, in the open; it is not part of the data.
-OUTSIDE_ALBEDO = 0.2
 
 
-@dataclass(frozen=True, eq=False)
-class Camera:
-    """A pinhole. eye, look : (3,) float64 [m]; fov_degrees is horizontal; width in pixels."""
+def city_radiance(
+    engine: Engine, scene: PreviewScene, camera: Camera, lighting: Lighting, indirect: Indirect = "on", settings: Settings = NEUTRAL
+) -> Float32:
+    """``render`` with an engine's lamps and volumes, under the artists' settings. Raises CorruptFileError."""
+    low, high = engine.dataset.world.bounds
 
-    eye: Float64
-    look: Float64
-    fov_degrees: float
-    width: int
+    def volume_at(position: Float64) -> Volume:
+        # A tile's centre may lie beyond the world's edge though its pixels do not.
+        return engine.volume(np.clip(position, low, high), lighting, settings)
 
-    @property
-    def height(self) -> int:
-        return max(int(self.width * ASPECT), 1)
-
-    def rays(self) -> Float32:
-        """(height * width, 3) float32 unit directions through pixel centres, rows from the top, world frame."""
-        forward = (self.look - self.eye) / np.linalg.norm(self.look - self.eye)
-        up_hint = np.array([0.0, 1.0, 0.0]) if abs(forward[1]) < 0.9999 else np.array([0.0, 0.0, -1.0])
-        right = np.cross(forward, up_hint)
-        right /= np.linalg.norm(right)
-        up = np.cross(right, forward)
-        reach = np.tan(np.radians(self.fov_degrees) / 2)
-        across = ((np.arange(self.width) + 0.5) / self.width * 2 - 1) * reach
-        down = ((np.arange(self.height) + 0.5) * 2 - self.height) / self.width * reach
-        directions = forward + across[None, :, None] * right - down[:, None, None] * up
-        directions /= np.linalg.norm(directions, axis=2, keepdims=True)
-        return np.ascontiguousarray(directions.reshape(-1, 3), np.float32)
+    lamps = settings.brightened(lamps_on(engine.lamps, lighting))
+    return render(camera, scene, settings.light(lighting), lamps, volume_at, indirect)
 
 
-def render(camera: Camera, scene: PreviewScene, lighting: Lighting, volume_at: VolumeAt, indirect: Indirect) -> Float32:
-    """Radiance (height, width, 3) float32 [cd m^-2]. ``volume_at`` gives the served volume around a world position (3,) [m]."""
+def render(
+    camera: Camera, scene: PreviewScene, lighting: Lighting, lamps: Sequence[Lamp], volume_at: VolumeAt, indirect: Indirect
+) -> Float32:
+    """Radiance (height, width, 3) float32 [cd m^-2]. ``lamps`` are those that are on; ``volume_at`` gives the served volume around a
+    world position (3,) [m]."""
     directions = camera.rays()
+    shape = (camera.height, camera.width, 3)
     if scene.rays is None:
-        radiance = background(lighting, directions)
-    else:
-        surface = scene.rays.first_surface(camera.eye, directions)
-        hit, missed = np.flatnonzero(surface.hit), np.flatnonzero(~surface.hit)
-        radiance = np.empty((len(directions), 3), np.float32)
-        radiance[missed] = background(lighting, directions[missed])
-        position, normal, triangle = surface.position[hit], surface.normal[hit], surface.triangle[hit]
-        irradiance = np.zeros((len(hit), 3), np.float64)
-        for light in lighting.directional_lights:
-            cosine = np.maximum(normal @ light.direction, 0) * scene.rays.lit(position, normal, light.direction)
-            irradiance += cosine[:, None] * light.irradiance
-        wanted = indirect_pixels(hit, camera.width, indirect)
-        if len(wanted):
-            irradiance[wanted] += indirect_irradiance(position[wanted], normal[wanted], volume_at)
-        radiance[hit] = scene.albedo[triangle] / np.pi * irradiance + scene.emission[triangle]
-    return radiance.reshape(camera.height, camera.width, 3)
+        return background(lighting, directions).reshape(shape)
+    surface = scene.rays.first_surface(camera.eye, directions)
+    hit, missed = np.flatnonzero(surface.hit), np.flatnonzero(~surface.hit)
+    radiance = np.empty((len(directions), 3), np.float32)
+    radiance[missed] = background(lighting, directions[missed])
+    position, normal, triangle = surface.position[hit], surface.normal[hit], surface.triangle[hit]
+    irradiance = direct_irradiance(scene.rays, lighting, lamps, position, normal)
+    wanted = indirect_pixels(hit, camera.width, indirect)
+    if len(wanted):
+        irradiance[wanted] += indirect_irradiance(position[wanted], normal[wanted], volume_at)
+    albedo = seen_albedo(scene, lighting, position, normal, triangle)
+    radiance[hit] = albedo / np.pi * irradiance + scene.emission[triangle]
+    radiance[hit] = through_fog(radiance[hit], surface.distance[hit], lighting)
+    plain = plain_distance(camera.eye, directions[missed], float(scene.rays.low[1]))
+    radiance[missed] = through_fog(radiance[missed], plain, lighting)
+    picture = radiance.reshape(shape)
+    draw_lamps(picture, camera, scene.rays, lamps, surface.distance, lighting.fog_density)
+    return picture
+
+
+def direct_irradiance(rays: RayCaster, lighting: Lighting, lamps: Sequence[Lamp], position: Float64, normal: Float32) -> Float64:
+    """What sun, moon and lamps give surface points (n, 3) [m] with normals (n, 3), shadowed: (n, 3) [lx]."""
+    irradiance = lamp_irradiance(rays, lamps, position, normal).astype(np.float64)
+    for light in lighting.directional_lights:
+        cosine = np.maximum(normal @ light.direction, 0) * rays.lit(position, normal, light.direction)
+        irradiance += cosine[:, None] * light.irradiance
+    return irradiance
+
+
+def seen_albedo(scene: PreviewScene, lighting: Lighting, position: Float64, normal: Float32, triangle: Int32) -> Float32:
+    """Albedo (n, 3) of surface points (n, 3) [m], white where snow lies."""
+    albedo, rays = scene.albedo[triangle], scene.rays
+    if lighting.snow == 0 or rays is None:
+        return albedo
+    stays = snow_attribute(normal, lambda flat: rays.lit(position[flat], normal[flat], STRAIGHT_UP))
+    return whitened(albedo, np.float32(lighting.snow) * stays)
 
 
 def indirect_pixels(pixel: Int64, width: int, indirect: Indirect) -> Int64:
@@ -120,21 +138,3 @@ def plan_volumes(points: Float64) -> tuple[Float64, Int64]:
     kept = np.sort(np.argsort(-counts, kind="stable")[:MAX_VOLUMES])
     distance = np.linalg.norm(centres[:, None] - centres[None, kept], axis=2)
     return centres[kept], np.argmin(distance, axis=1)[tile_of]
-
-
-def background(lighting: Lighting, directions: Float32) -> Float32:
-    """Radiance (n, 3) float32 [cd m^-2] along directions (n, 3) that meet nothing: sky, or an open plain below the horizon."""
-    sky = lighting.sky_radiance
-    rows, columns = sky.shape[0], sky.shape[1]
-    polar = np.arccos(np.clip(directions[:, 1], -1, 1)) / np.pi * rows - 0.5
-    around = np.arctan2(directions[:, 2], directions[:, 0]) / (2 * np.pi) * columns - 0.5
-    # Rows below the horizon are black: interpolating into them would draw a dark line along it.
-    row = np.clip(polar, 0, rows // 2 - 1.001)
-    row0, column0 = row.astype(np.int64), np.floor(around).astype(np.int64)
-    down, right = (row - row0)[:, None], (around - column0)[:, None]
-    texel = [[sky[row0 + i, (column0 + j) % columns] for j in (0, 1)] for i in (0, 1)]
-    top, bottom = (line[0] * (1 - right) + line[1] * right for line in texel)
-    radiance = top * (1 - down) + bottom * down
-    open_ground = lighting.sky_cube[2] + sum(light.irradiance * max(light.direction[1], 0.0) for light in lighting.directional_lights)
-    radiance[directions[:, 1] < 0] = OUTSIDE_ALBEDO / np.pi * open_ground
-    return np.asarray(radiance, np.float32)

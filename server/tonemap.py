@@ -19,9 +19,13 @@ METER_PER_EV = 0.125
 
 
 def metered(radiance: Float32, ev100: float) -> float:
-    """EV100 for a picture (..., 3) [cd m^-2]: the sky's, unless lamps make the picture brighter than the sky would."""
+    """EV100 for a picture (..., 3) [cd m^-2]: the sky's, unless lamps make the picture brighter than the sky would.
+
+    The meter reads the mean lightness, a cube root (CIE 1976): a mean of luminance would follow the few pixels of the lamps themselves,
+    a mean of logarithms the black sky above a lit street.
+    """
     luminance = np.maximum(radiance @ LUMINANCE_FROM_RGB.astype(np.float32), np.float32(1e-6))
-    return max(ev100, float(np.log2(np.exp(np.log(luminance).mean()) / METER_PER_EV)))
+    return max(ev100, 3 * float(np.log2(np.cbrt(luminance).mean(dtype=np.float64))) - float(np.log2(METER_PER_EV)))
 
 
 def exposed(radiance: Float32, ev100: float) -> Float32:
@@ -41,9 +45,14 @@ def srgb_bytes(linear: Float32) -> UInt8:
     return np.asarray(encoded * 255 + 0.5).astype(np.uint8)
 
 
+def developed(radiance: Float32, ev100: float) -> UInt8:
+    """Radiance (..., 3) [cd m^-2], exposed at ``ev100``, as sRGB 0..255."""
+    return srgb_bytes(filmic(exposed(radiance, ev100)))
+
+
 def png(radiance: Float32, ev100: float) -> bytes:
     """A PNG of radiance (rows, columns, 3) [cd m^-2]; ``ev100`` suits what the sky lights."""
-    picture: AnyArray = srgb_bytes(filmic(exposed(radiance, metered(radiance, ev100))))
+    picture: AnyArray = developed(radiance, metered(radiance, ev100))
     out = io.BytesIO()
     Image.fromarray(picture).save(out, "PNG", compress_level=6)
     return out.getvalue()

@@ -17,6 +17,11 @@ function moment() {
   return at("date").value ? `${at("date").value}T${clock}` : clock;
 }
 
+function say(text, kind = "") {
+  at("status").textContent = text;
+  at("status").className = kind;
+}
+
 async function ask(path) {
   const reply = await fetch(path);
   if (reply.ok) return reply;
@@ -29,6 +34,7 @@ async function refresh() {
   if (busy) return;
   busy = true;
   at("picture").classList.add("waiting");
+  say("drawing …");
   while (wanted) {
     wanted = false;
     at("fov-shown").value = `${at("fov").value}°`;
@@ -41,11 +47,9 @@ async function refresh() {
       const picture = await (await ask(`v1/preview.png?${view}`)).blob();
       URL.revokeObjectURL(at("picture").src);
       at("picture").src = URL.createObjectURL(picture);
-      at("status").textContent = `${Math.round(performance.now() - started)} ms`;
-      at("status").className = "";
+      say(`drawn in ${Math.round(performance.now() - started)} ms`);
     } catch (error) {
-      at("status").textContent = error.message;
-      at("status").className = "failed";
+      say(error.message, "failed");
     }
   }
   at("picture").classList.remove("waiting");
@@ -54,12 +58,12 @@ async function refresh() {
 
 function showSun(light) {
   const luminance = ([r, g, b]) => 0.2126 * r + 0.7152 * g + 0.0722 * b;
-  const lux = (rgb) => `${luminance(rgb).toPrecision(3)} lx`;
+  const lux = (rgb) => `${luminance(rgb).toLocaleString("en", { maximumSignificantDigits: 3 }).replaceAll(",", "\u202f")} lx`;
   const elevation = (d) => `${(Math.asin(Math.max(-1, Math.min(1, d[1]))) * 180 / Math.PI).toFixed(1)}°`;
   const rows = {
     "Sun": lux(light.sun.irradiance), "Sun's elevation": elevation(light.sun.direction),
     "Moon": lux(light.moon.irradiance), "Moon's elevation": elevation(light.moon.direction),
-    "Open sky, upwards": lux(light.sky_cube[2]), "Exposure": `EV ${light.exposure.toFixed(1)}`,
+    "Open sky, upwards": lux(light.sky_cube[2]), "Exposure for the sky": `EV ${light.exposure.toFixed(1)}`,
   };
   at("sun").replaceChildren(...Object.entries(rows).flatMap(([name, value]) => {
     const term = document.createElement("dt"), text = document.createElement("dd");
@@ -97,15 +101,26 @@ function listen() {
   for (const id of ["minutes", "date", "weather", "gi", "fov"]) at(id).addEventListener("input", refresh);
   for (const id of ["eye", "look"]) {
     at(id).addEventListener("change", () => {
-      Object.assign(camera, { eye: parse(at("eye").value), look: parse(at("look").value) });
-      refresh();
+      const place = parse(at(id).value);
+      if (place.length === 3 && place.every(Number.isFinite)) {
+        camera[id] = place;
+        refresh();
+      } else {
+        at(id).value = show(camera[id]);
+        say("expected three numbers, x,y,z in metres, such as 14,3,68", "failed");
+      }
     });
   }
   at("controls").addEventListener("submit", (event) => event.preventDefault());
   const keys = { w: [4, 0, 0], s: [-4, 0, 0], a: [0, -4, 0], d: [0, 4, 0], e: [0, 0, 4], q: [0, 0, -4] };
   addEventListener("keydown", (event) => {
-    if (["INPUT", "SELECT"].includes(event.target.tagName)) return;
+    // Sliders have no use for letters; what is typed into the others is theirs.
+    if (event.target.matches("input:not([type=range]), select") || event.ctrlKey || event.metaKey || event.altKey) return;
     const step = keys[event.key.toLowerCase()];
+    if (step) move(...step);
+  });
+  at("steps").addEventListener("click", (event) => {
+    const step = keys[event.target.dataset.key];
     if (step) move(...step);
   });
   let last = null;
@@ -127,16 +142,13 @@ async function start() {
   at("name").textContent = world.name;
   at("date").value = world.location.date;
   at("weather").replaceChildren(...world.weather.map((name) => new Option(name)));
-  // The first view: from above the southern edge, a third of the way up to the roofs, over the middle.
+  // The first view: from beyond the southern edge, or 500 m, a little below the highest roofs, over the middle.
   const { minimum: low, maximum: high } = world.bounds;
   const middle = low.map((v, i) => (v + high[i]) / 2);
   const reach = Math.min(Math.max(high[2] - low[2], high[0] - low[0]), 500) / 2;
-  setCamera([middle[0] + 0.35 * reach, high[1] * 0.8 + 20, middle[2] + reach], [middle[0], low[1] + 10, middle[2]]);
+  setCamera([middle[0] + 0.7 * reach, low[1] + 0.8 * (high[1] - low[1]), middle[2] + 1.7 * reach], [middle[0], middle[1] * 0.6, middle[2]]);
   listen();
   refresh();
 }
 
-start().catch((error) => {
-  at("status").textContent = error.message;
-  at("status").className = "failed";
-});
+start().catch((error) => say(error.message, "failed"));

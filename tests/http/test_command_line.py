@@ -36,7 +36,7 @@ def expect_refusal(done: Any, *words: str) -> None:
 
 
 def test_every_command_has_help(sectorlight: RunCommand) -> None:
-    for command in ([], ["bake"], ["info"], ["serve"], ["compare"], ["bench"], ["loadtest"]):
+    for command in ([], ["bake"], ["info"], ["serve"], ["compare"], ["strip"], ["bench"], ["loadtest"]):
         done = sectorlight(*command, "--help")
         assert done.returncode == 0
         assert "Usage" in done.stdout

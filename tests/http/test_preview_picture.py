@@ -12,7 +12,9 @@ from gi_core.constants import VOLUME_SHAPE, VOXEL_SIZE_M
 from gi_core.grid import SectorIndex, volume_first_voxel, voxel_centre
 from gi_core.lighting import DirectionalLight, Lighting
 from server import tonemap
-from server.preview import MAX_VOLUMES, Camera, background, indirect_pixels, plan_volumes, render
+from server.camera import Camera
+from server.preview import MAX_VOLUMES, indirect_pixels, plan_volumes, render
+from server.preview_air import background
 from server.preview_scene import MAX_SECTORS, PreviewScene, plan_sectors
 from server.raycast import RayCaster
 
@@ -100,12 +102,12 @@ def test_a_picture_adds_direct_and_served_light_by_lambert_s_law() -> None:
     uniform = np.full((6, *VOLUME_SHAPE, 3), 300.0, np.float32)
     camera = Camera(np.array([10.0, 8.0, 0.0]), np.array([10.0, 0.0, 0.001]), 30.0, 16)
     lighting = light((0, 1, 0), 1000.0, 50.0)
-    on = render(camera, one_scene(0.5), lighting, served(uniform), "on")
-    off = render(camera, one_scene(0.5), lighting, served(uniform), "off")
+    on = render(camera, one_scene(0.5), lighting, (), served(uniform), "on")
+    off = render(camera, one_scene(0.5), lighting, (), served(uniform), "off")
     # rtol 1e-4: float32 normals and cosines
     np.testing.assert_allclose(on, 0.5 / np.pi * 1300, rtol=1e-4)
     np.testing.assert_allclose(off, 0.5 / np.pi * 1000, rtol=1e-4)
-    split = render(camera, one_scene(0.5), lighting, served(uniform), "split")
+    split = render(camera, one_scene(0.5), lighting, (), served(uniform), "split")
     np.testing.assert_array_equal(split[:, :8], off[:, :8])
     np.testing.assert_array_equal(split[:, 8:], on[:, 8:])
 
@@ -114,14 +116,14 @@ def test_the_face_that_a_surface_turns_to_lights_it() -> None:
     faces = np.zeros((6, *VOLUME_SHAPE, 3), np.float32)
     faces[3] = 700.0  # -Y: light from below
     below = Camera(np.array([-10.0, 5.0, 0.0]), np.array([-10.0, 10.0, 0.001]), 30.0, 16)
-    picture = render(below, one_scene(0.5), light((0, 1, 0), 0.0, 0.0), served(faces), "on")
+    picture = render(below, one_scene(0.5), light((0, 1, 0), 0.0, 0.0), (), served(faces), "on")
     np.testing.assert_allclose(picture, 0.5 / np.pi * 700, rtol=1e-4)
 
 
 def test_emission_needs_no_light() -> None:
     scene = PreviewScene(floor_with_roof(0.0), np.zeros((4, 3), np.float32), np.full((4, 3), 12.0, np.float32))
     camera = Camera(np.array([10.0, 8.0, 0.0]), np.array([10.0, 0.0, 0.001]), 30.0, 16)
-    np.testing.assert_array_equal(render(camera, scene, light((0, 1, 0), 0.0, 0.0), served(np.zeros((6, 16, 32, 32, 3))), "off"), 12.0)
+    np.testing.assert_array_equal(render(camera, scene, light((0, 1, 0), 0.0, 0.0), (), served(np.zeros((6, 16, 32, 32, 3))), "off"), 12.0)
 
 
 def test_the_background_is_the_sky_and_an_open_plain() -> None:
@@ -214,3 +216,6 @@ def test_the_meter_follows_lamps_but_never_opens_beyond_the_sky():
     assert tonemap.metered(gray, 0.0) == pytest.approx(np.log2(800), abs=1e-3)
     assert tonemap.metered(gray, 15.0) == 15.0
     assert tonemap.metered(np.zeros((4, 4, 3), np.float32), -3.0) == -3.0
+    under_black_sky = gray.copy()
+    under_black_sky[:2] = 1e-5
+    assert tonemap.metered(under_black_sky, 0.0) == pytest.approx(np.log2(800) - 3, abs=0.05)  # half the lightness
