@@ -20,6 +20,7 @@ from gi_core.resident_sector import ResidentSector
 from gi_core.sector import Sector
 from gi_core.settings import Settings
 from gi_core.shadow_map import ShadowMap, SunSamples
+from gi_core.shadow_plan import ShadowPlan
 from gi_core.world import Lamp
 
 # After a change this large, as a share, a relight makes several passes, so that bounces follow at once.
@@ -67,8 +68,8 @@ class LiveSector:
         self.resident.prepare()
         self.lamps = SurfelLights(device, sector, geometry)
         self.samples: SunSamples | None = None
-        self.sampled_in = 0
-        """Number of the shadow map that its samples are from; 0 before any."""
+        self.sampled_of: ShadowPlan | None = None
+        """The plan of the shadow map that its samples are from; None before any."""
         self.change = 1.0
         """How far its light is from what it should be, beyond what the sky's own change says: 0 is settled."""
         self.exact = False
@@ -104,13 +105,13 @@ class LiveSector:
         if self.samples is None:
             self.samples = SunSamples(self._device, self.resident)
         shadow_map.sample(self.samples)
-        self.sampled_in = shadow_map.number
+        self.sampled_of = shadow_map.plan
         self.change, self.exact = max(self.change, BURST_CHANGE), False
 
     def drop_sun_samples(self) -> None:
         """Back to the bake's visibility: the sun has set, or there is no map any more."""
         if self.samples is not None:
-            self.samples, self.sampled_in = None, 0
+            self.samples = self.sampled_of = None
             self.resident.set_sun_sample(None)
             self.change, self.exact = max(self.change, BURST_CHANGE), False
 

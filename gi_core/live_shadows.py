@@ -12,36 +12,44 @@ from gi_core.constants import SECTOR_SIZE_M
 from gi_core.dataset import Dataset
 from gi_core.device import Device
 from gi_core.errors import SectorlightError
-from gi_core.grid import SectorIndex
+from gi_core.grid import SectorIndex, volume_first_voxel
 from gi_core.layout import SHADOW_TRIANGLE
 from gi_core.live_sector import LiveSector
 from gi_core.relight_input import RelightInput
 from gi_core.shadow_map import ShadowMap
-from gi_core.shadow_plan import MAP_TEXELS, TEXELS_PER_METRE, MovingBox, ShadowPlan, caster_records, needs_drawing, plan_map
+from gi_core.shadow_plan import MAP_TEXELS, TEXELS_PER_METRE, MovingBox, ShadowPlan, caster_records, plan_map, sun_or_box_moved
+from gi_core.volume import plan_boxes
 
 log = logging.getLogger("sectorlight.shadows")
 
 # Of one tick: half a millisecond of a core each.
 TRIANGLES_PER_TICK = 3000
 SECTORS_SAMPLED_PER_TICK = 2
+# Where many walk, the next tick looks at others.
+PLAYERS_LOOKED_AT_PER_TICK = 4
 # Triangles of sectors towards the sun that are kept in memory, 48 bytes each.
 KEPT_BYTES = 1 << 26
 
 
 class LiveShadows:
-    """Decides what the map shows and when; the ticker's alone. Geometry is read by a thread of its own."""
+    """Decides what the map shows and when; the ticker's alone. Geometry is read by a thread of its own.
+
+    A sector's samples hold wherever players go: they are taken anew when the sun or a box has moved, and when a sector that lay half in
+    a map lies whole in another. So a map is drawn only when some player's volume reads a sector whose samples are missing or old.
+    """
 
     def __init__(self, device: Device, dataset: Dataset) -> None:
+        self._known = frozenset(dataset.world.sectors)
         self._dataset = dataset
         low, high = dataset.world.bounds[:, 1]
         self._heights = float(low), float(high)
         self._map = ShadowMap(device, self._cast, self._heights[1])
         self._reader = ThreadPoolExecutor(1, thread_name_prefix="shadow-geometry")
         self._casters: OrderedDict[SectorIndex, Future[AnyArray]] = OrderedDict()
+        self._caster_bytes = 0
         self._planned: ShadowPlan | None = None
-        self._last: dict[int, ShadowPlan] = {}
         self._turn = 0
-        self._covers: tuple[SectorIndex, ...] = ()
+        self._to_sample: list[SectorIndex] = []
         self._dark = True
 
     @property
@@ -60,24 +68,42 @@ class LiveShadows:
         """One tick's share of planning, drawing and sampling, for players at positions (p, 3) [m]."""
         if not sun_is_up:
             if not self._dark:
-                self._planned, self._last, self._covers, self._dark = None, {}, (), True
+                self._planned, self._to_sample, self._dark = None, [], True
                 for sector in residents.values():
                     sector.drop_sun_samples()
             return
         self._dark = False
-        # Sectors that have arrived since the map was drawn are sampled too.
-        waiting = [i for i in self._covers if i in residents and residents[i].sampled_in != self._map.number]
-        for index in waiting[:SECTORS_SAMPLED_PER_TICK]:
-            residents[index].sample_sun(self._map)
-        if self._map.is_drawing:
+        plan = self._map.plan
+        if self._to_sample and plan is not None:
+            for index in self._to_sample[:SECTORS_SAMPLED_PER_TICK]:
+                if index in residents and wants_samples(residents[index], index, plan):
+                    residents[index].sample_sun(self._map)
+            del self._to_sample[:SECTORS_SAMPLED_PER_TICK]
+        elif self._map.is_drawing:
             if self._map.draw(TRIANGLES_PER_TICK):
-                self._covers = covered(self._map.plan, self._dataset.world.sectors)
+                self._to_sample = list(covered(self._map.plan, residents))
         elif self._planned is not None:
             if all(self._caster(index).done() for index in self._planned.sectors):
                 self._map.begin(self._planned)
                 self._planned = None
-        elif not waiting and len(positions):
-            self._plan(positions, np.asarray(given.lights["direction"][0, :3], np.float64), boxes)
+        elif len(positions):
+            self._plan(positions, np.asarray(given.lights["direction"][0, :3], np.float64), boxes, residents)
+
+    def _plan(self, positions: Float64, to_sun: Float64, boxes: Sequence[MovingBox], residents: Mapping[SectorIndex, LiveSector]) -> None:
+        """Plan a map for the next player, in turn, whose volume reads a sector that lacks samples."""
+        count = len(positions)
+        for offset in range(min(count, PLAYERS_LOOKED_AT_PER_TICK)):
+            player = (self._turn + offset) % count
+            touched = (box.index for box in plan_boxes(volume_first_voxel(positions[player])))
+            here = [index for index in touched if index in residents]
+            if any(lacks_samples(residents[index], to_sun, boxes) for index in here):
+                self._turn = player + 1
+                self._planned = plan_map(positions[player], to_sun, self._known, *self._heights, boxes)
+                if self._planned is not None:
+                    for index in self._planned.sectors:
+                        self._caster(index)
+                return
+        self._turn += PLAYERS_LOOKED_AT_PER_TICK
 
     def warm_up(self, sector: LiveSector) -> None:
         """Compile and run the map's kernels, and forget what they drew."""
@@ -92,28 +118,16 @@ class LiveShadows:
         """Stop reading."""
         self._reader.shutdown(cancel_futures=True)
 
-    def _plan(self, positions: Float64, to_sun: Float64, boxes: Sequence[MovingBox]) -> None:
-        """Plan a map for the next player, in turn, who needs one."""
-        count = len(positions)
-        self._last = {player: plan for player, plan in self._last.items() if player < count}
-        for offset in range(count):
-            player = (self._turn + offset) % count
-            if needs_drawing(self._last.get(player), positions[player], to_sun, boxes):
-                plan = plan_map(positions[player], to_sun, self._dataset.world.sectors, *self._heights, boxes)
-                self._turn = player + 1
-                if plan is not None:
-                    self._planned = self._last[player] = plan
-                    for index in plan.sectors:
-                        self._caster(index)
-                return
-
     def _caster(self, index: SectorIndex) -> "Future[AnyArray]":
         found = self._casters.get(index)
         if found is None:
+            facts = self._dataset.world.sectors[index]
+            self._caster_bytes += SHADOW_TRIANGLE.dtype.itemsize * facts.triangles
             found = self._casters[index] = self._reader.submit(self._read, index)
+            while len(self._casters) > 1 and self._caster_bytes > KEPT_BYTES:
+                gone, _ = self._casters.popitem(last=False)
+                self._caster_bytes -= SHADOW_TRIANGLE.dtype.itemsize * self._dataset.world.sectors[gone].triangles
         self._casters.move_to_end(index)
-        while len(self._casters) > 1 and sum(f.result().nbytes for f in self._casters.values() if f.done()) > KEPT_BYTES:
-            self._casters.popitem(last=False)
         return found
 
     def _read(self, index: SectorIndex) -> AnyArray:
@@ -125,6 +139,26 @@ class LiveShadows:
 
     def _cast(self, index: SectorIndex) -> AnyArray:
         return self._caster(index).result()
+
+
+def lacks_samples(sector: LiveSector, to_sun: Float64, boxes: Sequence[MovingBox]) -> bool:
+    """Whether a sector that a volume reads has no samples, or old ones: the sun or a box has moved since."""
+    of = sector.sampled_of
+    return of is None or sun_or_box_moved(of, to_sun, boxes)
+
+
+def wants_samples(sector: LiveSector, index: SectorIndex, plan: ShadowPlan) -> bool:
+    """Whether a map says more of a sector than its samples do."""
+    of = sector.sampled_of
+    if of is None or sun_or_box_moved(of, plan.to_sun, plan.boxes):
+        return True
+    return covers_whole(plan, index) and not covers_whole(of, index)
+
+
+def covers_whole(plan: ShadowPlan, index: SectorIndex) -> bool:
+    """Whether a sector's own ground lies in a map as far as its level extent goes."""
+    away = np.abs((index.origin + SECTOR_SIZE_M / 2 - plan.middle)[[0, 2]]).max()
+    return bool(away + SECTOR_SIZE_M / 2 <= MAP_TEXELS / TEXELS_PER_METRE / 2)
 
 
 def covered(plan: ShadowPlan | None, sectors: Collection[SectorIndex]) -> tuple[SectorIndex, ...]:

@@ -19,8 +19,6 @@ TEXELS_PER_METRE = 4.0
 MAX_REACH_M = 1500.0
 # The sun's disc is half a degree wide: a shadow's edge drawn this far off is still within its own penumbra.
 SUN_MOVED_DEGREES = 0.25
-# An eighth of the map: what the volume sees stays inside it.
-PLAYER_MOVED_M = 32.0
 BOX_MOVED_M = 0.5
 # A sample of a map drawn for a sun this far away still says more than baked directions many degrees apart.
 FRESH_DEGREES = 1.0
@@ -118,13 +116,9 @@ def _sectors_towards_sun(
     return tuple(index for index, ok in zip(near, meets.tolist(), strict=True) if ok)
 
 
-def needs_drawing(last: ShadowPlan | None, position: Float64, to_sun: Float64, boxes: Sequence[MovingBox]) -> bool:
-    """Whether sun, player or a box have moved enough since a map was planned for another to be drawn."""
-    if last is None:
-        return True
-    if float(last.to_sun @ to_sun) < math.cos(math.radians(SUN_MOVED_DEGREES)):
-        return True
-    if float(np.linalg.norm(position - last.middle)) > PLAYER_MOVED_M or len(boxes) != len(last.boxes):
+def sun_or_box_moved(last: ShadowPlan, to_sun: Float64, boxes: Sequence[MovingBox]) -> bool:
+    """Whether the sun or a box has moved enough since a map was planned for another to be drawn. The map's place is not asked for."""
+    if float(last.to_sun @ to_sun) < math.cos(math.radians(SUN_MOVED_DEGREES)) or len(boxes) != len(last.boxes):
         return True
     return any(math.dist(a.position, b.position) > BOX_MOVED_M for a, b in zip(boxes, last.boxes, strict=True))
 

@@ -44,5 +44,11 @@ __kernel void fill_volume(
                     + box.volume_first[0] + x;
     __attribute__((opencl_unroll_hint(BASIS_SIZE)))
     for (int b = 0; b < BASIS_SIZE; ++b)
-        vstore3(sum[b].xyz, b * voxels + at, volume);
+    {
+        // Three stores: vstore3 is a call (see sun_on_surfels.cl).
+        __global float *target = volume + 3 * (b * voxels + at);
+        target[0] = sum[b].x;
+        target[1] = sum[b].y;
+        target[2] = sum[b].z;
+    }
 }

@@ -255,14 +255,14 @@ def test_a_shadow_map_is_drawn_around_players_and_used(engine):
     try:
         run, light = Run(world), light_of(world, engine.lighting("15:00", "clear"))
         residents = world.streamer.residents
-        run.until(at(STREET), light, lambda r: len(residents) == 2 and all(s.sampled_in == 1 for s in residents.values()))
+        run.until(at(STREET), light, lambda r: len(residents) == 2 and all(s.sampled_of for s in residents.values()))
         sampled = [sector.samples.read()[0] for sector in residents.values()]
         assert all((sample != 255).mean() > 0.9 for sample in sampled)
         by_day = run.settle(at(STREET), light)
         # At night there is no sun whose shadows could be kept.
         run.settle(at(STREET), light_of(world, engine.lighting("23:30", "clear")))
         assert all(sector.samples is None for sector in residents.values())
-        run.until(at(STREET), light, lambda r: all(s.sampled_in == 2 for s in residents.values()))
+        run.until(at(STREET), light, lambda r: all(s.sampled_of for s in residents.values()))
         np.testing.assert_array_equal(run.settle(at(STREET), light), by_day)
     finally:
         world.close()

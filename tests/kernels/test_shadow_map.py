@@ -11,7 +11,7 @@ from gi_core.grid import SectorIndex
 from gi_core.layout import NO_SAMPLE, WHOLE_SAMPLE
 from gi_core.resident_sector import ResidentSector
 from gi_core.shadow_map import ShadowMap, SunSamples
-from gi_core.shadow_plan import MAP_TEXELS, MovingBox, box_corners, needs_drawing, oldest_fresh, plan_map, triangle_records
+from gi_core.shadow_plan import MAP_TEXELS, MovingBox, box_corners, oldest_fresh, plan_map, sun_or_box_moved, triangle_records
 
 ZERO = SectorIndex(0, 0)
 MIDDLE = np.array([32.0, 2.0, 32.0])
@@ -161,15 +161,13 @@ def test_a_ray_that_leaves_what_was_drawn_below_the_roofs_is_not_valid(device, m
     assert (samples.read()[0][facing] == NO_SAMPLE).all()
 
 
-def test_a_map_is_planned_anew_when_something_has_moved_enough():
+def test_a_map_is_planned_anew_when_sun_or_box_have_moved_enough():
     plan = plan_map(MIDDLE, towards(50.0), {ZERO}, 0.0, TOP, (MovingBox((0, 0, 0), (1, 1, 1)),))
     box = (MovingBox((0.3, 0, 0), (1, 1, 1)),)
-    assert not needs_drawing(plan, MIDDLE + 10.0, towards(50.1), box)
-    assert needs_drawing(None, MIDDLE, towards(50.0), ())
-    assert needs_drawing(plan, MIDDLE, towards(50.3), box)
-    assert needs_drawing(plan, MIDDLE + 40.0, towards(50.0), box)
-    assert needs_drawing(plan, MIDDLE, towards(50.0), (MovingBox((0.6, 0, 0), (1, 1, 1)),))
-    assert needs_drawing(plan, MIDDLE, towards(50.0), ())
+    assert not sun_or_box_moved(plan, towards(50.1), box)
+    assert sun_or_box_moved(plan, towards(50.3), box)
+    assert sun_or_box_moved(plan, towards(50.0), (MovingBox((0.6, 0, 0), (1, 1, 1)),))
+    assert sun_or_box_moved(plan, towards(50.0), ())
     assert plan_map(MIDDLE, towards(0.5), {ZERO}, 0.0, TOP) is None
 
 
