@@ -47,7 +47,7 @@ def voxel_centre(index: Int64) -> Float64:
 
 
 def volume_first_voxel(position: Float64, cascade: int = 0) -> Int64:
-    """Lattice index (3,) of voxel (0, 0, 0) of the volume centred on a world position, snapped to the cascade's lattice.
+    """Lattice index (..., 3) of voxel (0, 0, 0) of the volume centred on world positions (..., 3) [m], snapped to the cascade's lattice.
 
     The centre of the volume lies within half a voxel of the position along each axis.
     """

@@ -66,15 +66,13 @@ class LiveSector:
         """``tracing`` is held while lamps' shadows are traced: ``geometry`` is shared, and not for two threads at once."""
         self.resident = ResidentSector(device, sector, sky_patches)
         self.resident.prepare()
+        self.resident.release_host_arrays()
         self.lamps = SurfelLights(device, sector, geometry)
         self.samples: SunSamples | None = None
         self.sampled_of: ShadowPlan | None = None
         """The plan of the shadow map that its samples are from; None before any."""
-        self.change = 1.0
-        """How far its light is from what it should be, beyond what the sky's own change says: 0 is settled."""
-        self.exact = False
-        """Whether it holds the very bytes that a query would give for a light that stands still."""
-        self.lit_by: LightVector | None = None
+        self.is_lit = False
+        """Whether it was ever relit; before, it must not be shown."""
         self.shown_at = -1
         """The last tick in which what is shown of it changed."""
         self._device = device
@@ -106,14 +104,12 @@ class LiveSector:
             self.samples = SunSamples(self._device, self.resident)
         shadow_map.sample(self.samples)
         self.sampled_of = shadow_map.plan
-        self.change, self.exact = max(self.change, BURST_CHANGE), False
 
     def drop_sun_samples(self) -> None:
         """Back to the bake's visibility: the sun has set, or there is no map any more."""
         if self.samples is not None:
             self.samples = self.sampled_of = None
             self.resident.set_sun_sample(None)
-            self.change, self.exact = max(self.change, BURST_CHANGE), False
 
     def set_lamps(self, light: LiveLight, wait: bool) -> bool:
         """Have the next relight read these lamps; whether it will: without ``wait``, not while another thread traces shadows."""
@@ -142,22 +138,30 @@ class LiveSector:
         self._lamps_late = not self.set_lamps(light, wait=False)
         relighter.relight([self.resident], light.given, passes)
 
-    def measure(self, light: LiveLight) -> None:
-        """Read what a relight gave, and how far it moved."""
+    def measure(self) -> float:
+        """Read what a relight gave: how far it moved the probes' light, as a share of the brightest."""
         after = self.resident.read_cubes()
         peak = float(after.max(initial=0.0))
         moved = float(np.abs(after - self._cubes).max(initial=0.0))
-        self.change = 1.0 if self._lamps_late else moved / peak if peak > 0 else float(moved > 0)
-        self._cubes, self.lit_by, self.exact = after, light.vector, False
+        self._cubes, self.is_lit = after, True
+        if self._lamps_late:
+            return 1.0
+        return moved / peak if peak > 0 else float(moved > 0)
 
-    def settle(self, relighter: Relighter, light: LiveLight) -> None:
-        """Converge from darkness, as a query does: what is held then depends on the light alone, and on nothing that was before."""
+    def settle(self, relighter: Relighter, light: LiveLight) -> bool:
+        """Converge from darkness, as a query does: what is held then depends on the light alone, and on nothing that was before.
+
+        False, and nothing done, while another thread traces the shadows of lamps that this needs.
+        """
+        if not self.set_lamps(light, wait=False):
+            return False
         self._cubes = relighter.converge(self.resident, light.given).cubes
-        self.change, self.lit_by, self.exact = 0.0, light.vector, True
+        self.is_lit = True
+        return True
 
     def advance(self, tick: int, changed: bool) -> None:
         """Say whether what is shown changes at a tick: by a relight or other gains (``changed``), or because it fades in."""
-        if self.lit_by is not None and self._faded < FADE_TICKS:
+        if self.is_lit and self._faded < FADE_TICKS:
             self._faded += 1
             changed = True
         if changed:

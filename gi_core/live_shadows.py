@@ -64,22 +64,25 @@ class LiveShadows:
         sun_is_up: bool,
         boxes: Sequence[MovingBox],
         residents: Mapping[SectorIndex, LiveSector],
-    ) -> None:
-        """One tick's share of planning, drawing and sampling, for players at positions (p, 3) [m]."""
+    ) -> tuple[SectorIndex, ...]:
+        """One tick's share of planning, drawing and sampling, for players at positions (p, 3) [m]; sectors whose sun that changes."""
         if not sun_is_up:
-            if not self._dark:
-                self._planned, self._to_sample, self._dark = None, [], True
-                for sector in residents.values():
-                    sector.drop_sun_samples()
-            return
+            if self._dark:
+                return ()
+            self._planned, self._to_sample, self._dark = None, [], True
+            for sector in residents.values():
+                sector.drop_sun_samples()
+            return tuple(residents)
         self._dark = False
         plan = self._map.plan
         if self._to_sample and plan is not None:
-            for index in self._to_sample[:SECTORS_SAMPLED_PER_TICK]:
-                if index in residents and wants_samples(residents[index], index, plan):
-                    residents[index].sample_sun(self._map)
+            some = self._to_sample[:SECTORS_SAMPLED_PER_TICK]
             del self._to_sample[:SECTORS_SAMPLED_PER_TICK]
-        elif self._map.is_drawing:
+            chosen = tuple(index for index in some if index in residents and wants_samples(residents[index], index, plan))
+            for index in chosen:
+                residents[index].sample_sun(self._map)
+            return chosen
+        if self._map.is_drawing:
             if self._map.draw(TRIANGLES_PER_TICK):
                 self._to_sample = list(covered(self._map.plan, residents))
         elif self._planned is not None:
@@ -88,6 +91,7 @@ class LiveShadows:
                 self._planned = None
         elif len(positions):
             self._plan(positions, np.asarray(given.lights["direction"][0, :3], np.float64), boxes, residents)
+        return ()
 
     def _plan(self, positions: Float64, to_sun: Float64, boxes: Sequence[MovingBox], residents: Mapping[SectorIndex, LiveSector]) -> None:
         """Plan a map for the next player, in turn, whose volume reads a sector that lacks samples."""

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 import pyopencl as cl
 
-from gi_core.arrays import AnyArray, Float32, Float64, Int64, UInt8
+from gi_core.arrays import AnyArray, Float32, Int64, UInt8
 from gi_core.constants import VOLUME_SHAPE, VOXEL_NO_SECTOR
 from gi_core.device import Device
-from gi_core.grid import SectorIndex, volume_first_voxel
+from gi_core.grid import SectorIndex
 from gi_core.live_sector import LiveSector
 from gi_core.volume import SectorBox, box_mask, box_record, box_slices, nearest_columns, plan_boxes
 
@@ -55,10 +55,10 @@ class LiveVolume:
 
     def __init__(self, device: Device) -> None:
         self.published: PublishedVolume | None = None
-        self.wanted_since = -1
-        """The tick since which it waits to be filled; -1 when it does not."""
+        self.touched: tuple[SectorIndex, ...] = ()
+        """Sectors of the world that it reads, there or not."""
         self._device = device
-        self._first: Int64 | None = None
+        self._first: Int64 = np.zeros(3, np.int64)
         self._layout: _Layout | None = None
         self._present: frozenset[SectorIndex] = frozenset()
         self._buffer = device.allocate(4 * 3 * 6 * int(np.prod(VOLUME_SHAPE)))
@@ -69,32 +69,21 @@ class LiveVolume:
         """Bytes on the device."""
         return int(self._buffer.size)
 
-    def is_stale(self, position: Float64, residents: Mapping[SectorIndex, LiveSector], known: frozenset[SectorIndex]) -> bool:
-        """Whether a player at ``position`` (3,) [m] would see another volume than the published one. ``known``: sectors of the world."""
-        first = volume_first_voxel(position)
-        if self._first is None or not np.array_equal(first, self._first):
-            self._first = first
-            self._layout = None
-            self._touched = tuple(box.index for box in plan_boxes(first) if box.index in known)
-        present = frozenset(i for i in self._touched if i in residents and residents[i].lit_by is not None)
-        if present != self._present:
-            self._present, self._layout = present, None
-        if self._layout is None or self.published is None:
-            return True
-        return any(residents[index].shown_at > self._filled_at for index in present)
+    def move(self, first_voxel: Int64, known: frozenset[SectorIndex]) -> None:
+        """Stand elsewhere: the lattice index (3,) of voxel (0, 0, 0). ``known``: sectors of the world."""
+        self._first, self._layout = first_voxel, None
+        self.touched = tuple(box.index for box in plan_boxes(first_voxel) if box.index in known)
 
     def fill(
-        self,
-        tick: int,
-        residents: Mapping[SectorIndex, LiveSector],
-        known: frozenset[SectorIndex],
-        shown: ShownCubes,
-        placeholder: Callable[[SectorIndex], Float32],
+        self, tick: int, residents: Mapping[SectorIndex, LiveSector], shown: ShownCubes, placeholder: Callable[[SectorIndex], Float32]
     ) -> PublishedVolume:
-        """Fill what has changed and publish it. ``is_stale`` comes first: it is what looks at the position."""
-        assert self._first is not None
-        fresh = self._layout is None
-        layout = self._layout = self._layout or _lay_out(self._first, residents, known, self._present)
+        """Fill what has changed, and publish it."""
+        present = frozenset(i for i in self.touched if i in residents and residents[i].is_lit)
+        fresh = self._layout is None or present != self._present
+        if fresh:
+            self._present, self._layout = present, _lay_out(self._first, residents, frozenset(self.touched), present)
+        layout = self._layout
+        assert layout is not None
         for box, record in layout.boxes:
             sector = residents[box.index]
             if fresh or sector.shown_at > self._filled_at:
@@ -107,7 +96,7 @@ class LiveVolume:
             lack, nearest = layout.outside
             values[:, :, lack[:, 0], lack[:, 1]] = values[:, :, nearest[:, 0], nearest[:, 1]]
         values.setflags(write=False)
-        self._filled_at, self.wanted_since = tick, -1
+        self._filled_at = tick
         missing = tuple(index for index, _, _ in layout.placeholders)
         self.published = PublishedVolume(values, layout.mask, self._first, tick, layout.sectors, missing)
         return self.published

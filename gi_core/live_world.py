@@ -27,8 +27,8 @@ from gi_core.dataset import Dataset
 from gi_core.device import Device
 from gi_core.grid import SectorIndex, volume_first_voxel
 from gi_core.layout import DIRECTIONAL_LIGHT, MAX_DIRECTIONAL_LIGHTS
-from gi_core.light_blend import relative_changes
 from gi_core.light_geometry import ShadowGeometry
+from gi_core.light_needs import WHOLLY, LightNeeds
 from gi_core.live_sector import BURST_CHANGE, BURST_PASSES, LiveLight, LiveSector
 from gi_core.live_shadows import LiveShadows
 from gi_core.live_volume import LiveVolume
@@ -38,9 +38,8 @@ from gi_core.sector import Sector
 from gi_core.settings import NEUTRAL, Settings
 from gi_core.shadow_plan import MovingBox
 from gi_core.stream import Streamer, sector_table
-from gi_core.stream_need import distance_m
 from gi_core.stream_plan import StreamOptions, StreamPlan
-from gi_core.tick_plan import NEVER_RELIT, PLACES, SETTLED_CHANGE, plan_tick
+from gi_core.tick_plan import PLACES, plan_tick
 from gi_core.volume import box_record, plan_boxes
 
 DEFAULT_BUDGET_BYTES = 384 << 20
@@ -103,7 +102,11 @@ class LiveWorld:
         self._geometry = ShadowGeometry(dataset.geometry, dataset.world.sectors)
         self._tracing = threading.Lock()
         self.streamer = Streamer(sector_table(dataset.world), dataset.sector, self._place, stream or StreamOptions(budget_bytes))
-        self._relit_at: dict[SectorIndex, int] = {}
+        self._needs = LightNeeds(len(self.streamer.table.sectors))
+        self._row = {index: row for row, index in enumerate(self.streamer.table.sectors)}
+        self._firsts: dict[str, bytes] = {}
+        self._readers: dict[SectorIndex, set[str]] = {}
+        self._stale: dict[str, int] = {}
         self._light: LiveLight | None = None
         self._distant_sky = dataset.distant()
         self._shadows = LiveShadows(self._device, dataset) if shadow_map else None
@@ -131,23 +134,27 @@ class LiveWorld:
 
         report.loaded = tuple(self.streamer.take_over())
         for index in report.loaded:
-            self._relit_at[index] = NEVER_RELIT
+            self._needs.forget(self._row[index])
         self.plan = self.streamer.step(players.positions, players.velocities)
         report.evicted, report.missing = self.plan.evictions, self.plan.missing
-        for index in report.evicted:
-            self._relit_at.pop(index, None)
         lap("stream")
         gains_changed = self._light is not None and self._light.settings != light.settings
         self._light = light
-        self._relight(tick, players, light, report)
+        self._relight(tick, light, report)
         lap("relight")
         if self._shadows is not None:
-            self._shadows.step(players.positions, light.given, light.sun_is_up, boxes, self.streamer.residents)
+            sampled = self._shadows.step(players.positions, light.given, light.sun_is_up, boxes, self.streamer.residents)
+            for index in sampled:
+                self._needs.disturb(self._row[index], BURST_CHANGE)
         lap("shadow_map")
         lit = set(report.relit) | set(report.settled)
+        changed = list(report.evicted)
         for index, sector in self.streamer.residents.items():
             sector.advance(tick, gains_changed or index in lit)
-        self._fill(tick, players, light, report, started + fill_ms / 1e3)
+            if sector.shown_at == tick:
+                changed.append(index)
+        self._note_readers(tick, players, changed)
+        self._fill(tick, light, report, started + fill_ms / 1e3)
         lap("volumes")
         return report
 
@@ -184,9 +191,9 @@ class LiveWorld:
 
     def lamps_moved(self, touched: Sequence[tuple[Float64, float]]) -> None:
         """Lamps at positions (3,) [m] with ranges [m] have changed: sectors with a surface in range need light at once."""
-        for sector in self.streamer.residents.values():
+        for index, sector in self.streamer.residents.items():
             if any(sector.reaches(position, range_m) for position, range_m in touched):
-                sector.change, sector.exact = 1.0, False
+                self._needs.disturb(self._row[index], WHOLLY)
 
     def _place(self, sector: Sector) -> LiveSector:
         """In a loader's thread: on the device, with the shadows of the lamps that shine now."""
@@ -195,72 +202,68 @@ class LiveWorld:
             placed.set_lamps(self._light, wait=True)
         return placed
 
-    def _relight(self, tick: int, players: TickPlayers, light: LiveLight, report: TickReport) -> None:
-        residents = self.streamer.residents
-        if not residents:
+    def _relight(self, tick: int, light: LiveLight, report: TickReport) -> None:
+        residents, needs, plan = self.streamer.residents, self._needs, self.plan
+        if not residents or plan is None:
             return
-        indices = list(residents)
-        sectors = [residents[index] for index in indices]
-        changes = self._changes(sectors, light)
-        places = np.array(indices, np.int64).reshape(-1, 2)
-        away = distance_m(places, players.positions)
-        relit_at = np.array([self._relit_at[index] for index in indices], np.int64)
-        chosen = plan_tick(tick, relit_at, changes, away, places=self._places)
-        for row in chosen:
-            passes = BURST_PASSES if changes[row] > BURST_CHANGE else 1
-            sectors[row].relight(self._relighter, light, passes)
+        rows = self.streamer.resident_rows()
+        changes = needs.changes(rows, light.vector)
+        away = plan.needs.away_m[rows]
+        chosen = [int(rows[k]) for k in plan_tick(tick, needs.relit_at[rows], changes, away, places=self._places)]
+        change_of = dict(zip(rows.tolist(), changes.tolist(), strict=True))
+        sectors = [residents[self.streamer.table.sectors[row]] for row in chosen]
+        for row, sector in zip(chosen, sectors, strict=True):
+            passes = BURST_PASSES if change_of[row] > BURST_CHANGE else 1
+            sector.relight(self._relighter, light, passes)
             report.passes += passes
-        for row in chosen:
-            sectors[row].measure(light)
-            self._relit_at[indices[row]] = tick
-        report.relit = tuple(indices[row] for row in chosen)
+        for row, sector in zip(chosen, sectors, strict=True):
+            needs.relit(row, tick, light.vector, sector.measure())
+        report.relit = tuple(self.streamer.table.sectors[row] for row in chosen)
         if not chosen and light.standing:
             # An idle world has time to make what it shows the very bytes of a query: nearest first, one a tick.
-            inexact = [row for row in np.argsort(away, kind="stable").tolist() if not sectors[row].exact]
-            if inexact:
-                row = inexact[0]
-                sectors[row].relight(self._relighter, light, 0)
-                sectors[row].settle(self._relighter, light)
-                report.settled = (indices[row],)
+            inexact = np.flatnonzero(~needs.exact[rows])
+            if len(inexact):
+                row = int(rows[inexact[np.argmin(away[inexact])]])
+                index = self.streamer.table.sectors[row]
+                if residents[index].settle(self._relighter, light):
+                    needs.relit(row, tick, light.vector, 0.0, exact=True)
+                    report.settled = (index,)
 
-    def _changes(self, sectors: list[LiveSector], light: LiveLight) -> Float64:
-        """(n,): how far each sector is from its light: its bounces' own distance, and what the light has changed by since."""
-        own = np.array([sector.change for sector in sectors])
-        lit = [row for row, sector in enumerate(sectors) if sector.lit_by is not None]
-        if lit:
-            vectors = [sectors[row].lit_by for row in lit]
-            numbers = np.array([v.numbers for v in vectors if v is not None])
-            scales = np.array([v.scale for v in vectors if v is not None])
-            moved = relative_changes(numbers, scales, light.vector)
-            own[lit] = np.maximum(own[lit], moved)
-            for row, change in zip(lit, moved.tolist(), strict=True):
-                if change > 0:
-                    sectors[row].exact = False
-        if light.standing:
-            # What still stands below the threshold is settled exactly, later.
-            return own
-        return np.where(own > SETTLED_CHANGE, own, 0.0)
+    def _note_readers(self, tick: int, players: TickPlayers, changed: Sequence[SectorIndex]) -> None:
+        """Find the volumes that have to be filled: of players who moved to other voxels, and those that read a changed sector."""
+        for gone in self.volumes.keys() - set(players.ids):
+            for index in self.volumes.pop(gone).touched:
+                self._readers[index].discard(gone)
+            self._stale.pop(gone, None)
+            del self._firsts[gone]
+        firsts = volume_first_voxel(players.positions)
+        for row, name in enumerate(players.ids):
+            place = firsts[row].tobytes()
+            if self._firsts.get(name) != place:
+                self._firsts[name] = place
+                volume = self.volumes.get(name)
+                if volume is None:
+                    volume = self.volumes[name] = LiveVolume(self._device)
+                for index in volume.touched:
+                    self._readers[index].discard(name)
+                volume.move(firsts[row], self._known)
+                for index in volume.touched:
+                    self._readers.setdefault(index, set()).add(name)
+                self._stale.setdefault(name, tick)
+        for index in changed:
+            for name in self._readers.get(index, ()):
+                self._stale.setdefault(name, tick)
 
-    def _fill(self, tick: int, players: TickPlayers, light: LiveLight, report: TickReport, until: float) -> None:
+    def _fill(self, tick: int, light: LiveLight, report: TickReport, until: float) -> None:
         residents = self.streamer.residents
-        for gone in set(self.volumes) - set(players.ids):
-            del self.volumes[gone]
-        stale = []
-        for name, position in zip(players.ids, players.positions, strict=True):
-            volume = self.volumes.get(name)
-            if volume is None:
-                volume = self.volumes[name] = LiveVolume(self._device)
-            if volume.is_stale(position, residents, self._known):
-                if volume.wanted_since < 0:
-                    volume.wanted_since = tick
-                stale.append((volume.wanted_since, name, volume))
         filled: list[str] = []
-        for _, name, volume in sorted(stale, key=lambda entry: entry[:2]):
+        for name in sorted(self._stale, key=lambda name: (self._stale[name], name)):
             if filled and time.perf_counter() >= until:
                 break
-            volume.fill(tick, residents, self._known, lambda sector: self._shown(sector, light), self._placeholder)
+            self.volumes[name].fill(tick, residents, lambda sector: self._shown(sector, light), self._placeholder)
+            del self._stale[name]
             filled.append(name)
-        report.filled, report.waiting = tuple(filled), len(stale) - len(filled)
+        report.filled, report.waiting = tuple(filled), len(self._stale)
 
     def _shown(self, sector: LiveSector, light: LiveLight) -> cl.Buffer:
         return sector.shown(light.settings, lambda: self._placeholder(sector.resident.sector.index))

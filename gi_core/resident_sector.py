@@ -7,6 +7,7 @@ What changes seldom is worked out when it changes, and a pass only does what eve
     every pass      bounce_bricks, gather_probes
 """
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -82,6 +83,16 @@ class ResidentSector:
         if self.sector.probe_count and self.sector.brick_count:
             self._collect_bounces(0.0)
             self._bounces_of = 0.0
+
+    def release_host_arrays(self) -> None:
+        """Let go of the host's copies of what is only read on the device, two thirds of them: their places are taken by zeros that have the
+        same shape and no memory."""
+        if self.sun_visibility is None:
+            self.sun_visibility = self.device.upload(self.sector.sun_visibility)
+        gone = ("factor_weight", "factor_source", "surfel_albedo", "surfel_snow", "sun_visibility", "voxel_probe", "voxel_weight")
+        arrays: dict[str, AnyArray] = {name: getattr(self.sector, name) for name in gone}
+        empty: dict[str, Any] = {name: np.broadcast_to(a.dtype.type(0), a.shape) for name, a in arrays.items()}
+        self.sector = replace(self.sector, **empty)
 
     def set_lamps(self, surfel_light: cl.Buffer | None) -> None:
         """Irradiance [lx] that lamps give each surfel: (S, 4) float32 on the device, or None where there are none.

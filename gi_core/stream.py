@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gi_core.arrays import Float64
+from gi_core.arrays import Float64, Int64
 from gi_core.dataset import SectorFacts, WorldInfo
 from gi_core.grid import SectorIndex
 from gi_core.live_sector import LiveSector
@@ -57,10 +57,11 @@ class Streamer:
         self.residents: dict[SectorIndex, LiveSector] = {}
         self.failures: dict[SectorIndex, Failure] = {}
         self.loads = self.misses = 0
-        self._table, self._load, self._place, self._options = table, load, place, options
+        self.table, self._load, self._place, self._options = table, load, place, options
         self._row = {index: row for row, index in enumerate(table.sectors)}
         self._state = StreamState.empty(table)
         self._loading: set[SectorIndex] = set()
+        self._rows: Int64 = np.zeros(0, np.int64)
         self._done: queue.SimpleQueue[tuple[SectorIndex, LiveSector | Exception]] = queue.SimpleQueue()
         self._loaders = ThreadPoolExecutor(LOADERS, thread_name_prefix="sector-loader")
 
@@ -87,7 +88,8 @@ class Streamer:
             self._state.loading[row] = False
             if isinstance(found, LiveSector):
                 self.residents[index] = found
-                self._state.resident_bytes[row] = max(found.nbytes, int(self._table.bytes[row]))
+                self._rows = np.append(self._rows, row)
+                self._state.resident_bytes[row] = max(found.nbytes, int(self.table.bytes[row]))
                 self._state.retry_at_s[row] = 0.0
                 self.failures.pop(index, None)
                 self.loads += 1
@@ -101,9 +103,10 @@ class Streamer:
 
     def step(self, positions: Float64, velocities: Float64) -> StreamPlan:
         """Plan for players at positions (p, 3) [m] with velocities (p, 3) [m/s], evict and start to load."""
-        plan = plan_streaming(self._table, self._state, positions, velocities, now_s=time.monotonic(), options=self._options)
+        plan = plan_streaming(self.table, self._state, positions, velocities, now_s=time.monotonic(), options=self._options)
         for index in plan.evictions:
             del self.residents[index]
+            self._rows = self._rows[self._rows != self._row[index]]
             self._state.resident_bytes[self._row[index]] = 0
         for index in plan.loads:
             self._loading.add(index)
@@ -112,9 +115,9 @@ class Streamer:
         self.misses += len(plan.missing)
         return plan
 
-    def resident_rows(self) -> "np.ndarray[tuple[int], np.dtype[np.int64]]":
-        """Rows of the table that are resident, in the order of ``residents``."""
-        return np.array([self._row[index] for index in self.residents], np.int64)
+    def resident_rows(self) -> Int64:
+        """Rows of the table that are resident, in the order of their arrival."""
+        return self._rows
 
     def close(self) -> None:
         """Stop loading; waits for what is under way."""

@@ -1,0 +1,52 @@
+"""How far each sector of a world is from the light it should have: one row for each, so that a thousand cost what ten do."""
+
+import numpy as np
+
+from gi_core.arrays import Float64, Int64
+from gi_core.light_blend import LightVector, relative_changes
+from gi_core.tick_plan import NEVER_RELIT
+
+# Light that was never made is as far off as can be.
+WHOLLY = 1.0
+
+
+class LightNeeds:
+    """The ticker's alone. Rows are a stream_need.SectorTable's."""
+
+    def __init__(self, sectors: int) -> None:
+        self.relit_at: Int64 = np.full(sectors, NEVER_RELIT, np.int64)
+        """(n,) the tick of each sector's last relight."""
+        self.exact = np.zeros(sectors, bool)
+        """(n,) whether a sector holds the very bytes of a query, for light that stands still."""
+        self._change: Float64 = np.full(sectors, WHOLLY)
+        self._numbers: Float64 | None = None
+        self._scale: Float64 = np.zeros(sectors)
+
+    def forget(self, row: int) -> None:
+        """A sector has just arrived: nothing is known of its light."""
+        self.relit_at[row], self.exact[row], self._change[row] = NEVER_RELIT, False, WHOLLY
+
+    def disturb(self, row: int, change: float) -> None:
+        """Something has changed a sector's light by a share of it: a lamp, a look at the shadow map."""
+        self._change[row] = max(self._change[row], change)
+        self.exact[row] = False
+
+    def relit(self, row: int, tick: int, light: LightVector, change: float, exact: bool = False) -> None:
+        """A sector was relit under a light, and its probes moved by a share of their peak: so far from settled are its bounces."""
+        if self._numbers is None:
+            self._numbers = np.zeros((len(self._change), len(light.numbers)))
+        self._numbers[row], self._scale[row] = light.numbers, light.scale
+        self.relit_at[row], self._change[row], self.exact[row] = tick, change, exact
+
+    def changes(self, rows: Int64, light: LightVector) -> Float64:
+        """(k,) for some rows: how far each is from its light, by its bounces or by what the light has changed since its last relight.
+
+        Rows whose light has changed at all are no longer exact.
+        """
+        own = self._change[rows]
+        if self._numbers is None:
+            return own
+        lit = self.relit_at[rows] != NEVER_RELIT
+        moved = np.where(lit, relative_changes(self._numbers[rows], self._scale[rows], light), 0.0)
+        self.exact[rows[moved > 0]] = False
+        return np.maximum(own, moved)
