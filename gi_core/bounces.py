@@ -1,6 +1,6 @@
 """Light that has bounced in the air twice or more: tables of an infinite series of isotropic bounces, at nodes of haze, blended between.
 
-Hillaire, "A Scalable and Production Ready Sky and Atmosphere Rendering Technique", EGSR 2020. A table takes 40 ms, a blend 1 ms: so a
+Hillaire, "A Scalable and Production Ready Sky and Atmosphere Rendering Technique", EGSR 2020. A table takes 50 ms, a blend 1 ms: so a
 haze that changes all the time meets no more than the 15 nodes, and ``prepare_bounces`` can build them before it starts to change.
 """
 

@@ -10,7 +10,7 @@ from gi_core import lighting_steps
 from gi_core.clock_time import time_zone
 from gi_core.lighting import Lighting
 from gi_core.lighting_model import _make_lighting, make_lighting
-from gi_core.lighting_steps import FASTEST_DAY, FASTEST_PLACE, TOLERANCE, Step, largest_steps, main
+from gi_core.lighting_steps import FASTEST_DAY, FASTEST_PLACE, TOLERANCE, largest_steps, main
 from gi_core.lighting_table import illuminance
 from gi_core.sun import sun_position
 from gi_core.world import Location
