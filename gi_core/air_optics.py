@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gi_core.air import EARTH_RADIUS_KM, ColumnsAt, densities, disc_share
+from gi_core.air import EARTH_RADIUS_KM, ColumnsAt, disc_share
+from gi_core.air_profile import densities
 from gi_core.arrays import Float64
 from gi_core.spectrum import aerosol_depth, ozone_depth, rayleigh_depth
 
@@ -37,11 +38,13 @@ class AirOptics:
     def __init__(self, haze: float, aerosol_albedo: float) -> None:
         """haze : aerosol optical depth at 550 nm; aerosol_albedo : share of what aerosol meets that it scatters."""
         self.depth: Float64 = np.stack([rayleigh_depth(), aerosol_depth(haze), ozone_depth()])
+        # Along light's way its spreading counts as another depth, the same at all wavelengths.
+        self.path_depth: Float64 = np.concatenate([self.depth, np.ones((1, self.depth.shape[1]))])
         self.scatter: Float64 = self.depth[:2] * np.array([[1.0], [aerosol_albedo]])
 
     def sunlight(self, columns: ColumnsAt, sine: Float64) -> Float64:
         """(..., a, 8): sunlight at points in the air for sines of the sun's elevation (..., a), the Earth's shadow included."""
-        light = np.exp(-columns.towards(sine) @ self.depth)
+        light = np.exp(-columns.towards(sine) @ self.path_depth)
         light *= disc_share(columns.degrees_above_horizon(sine))[..., None]
         return np.asarray(light, np.float64)
 

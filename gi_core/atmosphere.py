@@ -17,12 +17,11 @@ from gi_core.arrays import Float64
 from gi_core.bounces import BouncesAt, prepare_bounces
 from gi_core.constants import SKY_SHAPE
 
-# Aerosol absorbs a tenth of what it meets and scatters forwards: continental average, Hess et al. 1998 (OPAC).
+# Aerosol absorbs a tenth of what it meets: continental average, Hess et al. 1998 (OPAC).
 AEROSOL_ALBEDO = 0.9
-AEROSOL_ASYMMETRY = 0.7
 HIGHEST_PLACE_KM = 8.0
 
-# Against 128 steps and 37 azimuths: 0.6 % of the sky's light.
+# Against 128 steps and 37 azimuths: 0.7 % of the sky's light.
 _RAY_STEPS = 32
 _AZIMUTHS = 13  # of the view relative to the sun, 0 to 180 degrees
 
@@ -49,16 +48,16 @@ class Atmosphere:
         sine = np.cos(polar)
         height = np.full(len(sine), height_km)
         self._view = self._optics.march(height, sine, distance_to_top(height, sine), _RAY_STEPS)
-        self._place, self._view_columns = ColumnsAt(np.array([height_km])), ColumnsAt(self._view.height)
+        self._place, self._view_columns = ColumnsAt(np.array([height_km]), seen=True), ColumnsAt(self._view.height)
         self._bounces = BouncesAt(haze, AEROSOL_ALBEDO, self._view.height)
 
     def beam(self, elevation_degrees: float) -> Float64:
-        """(8,) share of a light's spectrum that reaches a surface facing it; exactly 0 at and below the horizon."""
+        """(8,) share of a light's spectrum that reaches a surface facing it, by its elevation as seen; exactly 0 from the horizon down."""
         columns = self._place.towards(np.sin(np.radians([[elevation_degrees]])))[0, 0]
-        return np.asarray(np.exp(-columns @ self._optics.depth) * disc_share(np.asarray(elevation_degrees)), np.float64)
+        return np.asarray(np.exp(-columns @ self._optics.path_depth) * disc_share(np.asarray(elevation_degrees)), np.float64)
 
     def scattering(self, elevation_degrees: float, ground_albedo: float) -> SkyScattering:
-        """What the sky scatters from a light at an elevation, above or below the horizon."""
+        """What the sky scatters from a light, by its elevation without refraction, above or below the horizon."""
         elevation = np.radians(elevation_degrees)
         relative = np.linspace(0, np.pi, _AZIMUTHS)
         view, arc = self._view, self._view.arc[..., None]

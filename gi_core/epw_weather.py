@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from gi_core import snow_pack
-from gi_core.air import AEROSOL_HEIGHT_KM
+from gi_core.air_profile import HAZE_HEIGHT_KM
 from gi_core.arrays import Float64
 from gi_core.atmosphere import Atmosphere
 from gi_core.epw import EpwYear, read_epw
@@ -20,7 +20,7 @@ from gi_core.errors import InputError
 from gi_core.lighting_model import GROUND_ALBEDO, beam_irradiance
 from gi_core.sky import DROPLET_ASYMMETRY, FOG_LAYER_M, clear_sky, horizontal_illuminance
 from gi_core.spectrum import LUMINANCE_FROM_RGB, WAVELENGTH_NM
-from gi_core.sun import sun_position
+from gi_core.sun import STANDARD_PRESSURE_MBAR, STANDARD_TEMPERATURE_C, sun_position, without_refraction
 from gi_core.weather import WEATHER_RANGES, Weather, between, weather_of
 from gi_core.world import Location
 
@@ -74,7 +74,7 @@ def _hourly(year: EpwYear) -> Float64:
     haze = _within("haze", _filled(year.aerosol_depth, _USUAL_HAZE))
     extinction = _VISIBILITY_DEPTH / np.maximum(1000 * _filled(year.visibility_km, math.inf), 1.0)
     # What the haze itself takes from the view along the ground is no fog.
-    fog = _within("fog_density", np.maximum(extinction - haze / (1000 * AEROSOL_HEIGHT_KM), 0.0))
+    fog = _within("fog_density", np.maximum(extinction - haze / (1000 * HAZE_HEIGHT_KM), 0.0))
     elevation = _elevations(year)
     clear_global, clear_beam = _clear_hours(elevation, haze, fog)
 
@@ -143,7 +143,8 @@ def _clear_table() -> Float64:
         air = Atmosphere(haze, 0.0)
         for column, degrees in enumerate(_ELEVATIONS.tolist()):
             angle = math.radians(degrees)
-            sky = clear_sky(air, np.array([math.cos(angle), math.sin(angle), 0.0]), sun, GROUND_ALBEDO)
+            true = without_refraction(degrees, STANDARD_PRESSURE_MBAR, STANDARD_TEMPERATURE_C)
+            sky = clear_sky(air, np.array([math.cos(angle), math.sin(angle), 0.0]), sun, GROUND_ALBEDO, true)
             table[0, row, column] = LUMINANCE_FROM_RGB @ horizontal_illuminance(sky)
             table[1, row, column] = LUMINANCE_FROM_RGB @ beam_irradiance(air, degrees, sun)
     return table

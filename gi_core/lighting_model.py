@@ -24,9 +24,10 @@ GROUND_ALBEDO, SNOW_ALBEDO = 0.15, 0.7  # what the landscape around the city sen
 
 MEAN_MOON_DISTANCE_AU = 384_400 / 149_597_870.7
 LUX_PER_FOOTCANDLE = 10.7639
-# A light this far below the horizon adds a hundredth of the night's own glow; and the moon's sky adds 1e-4 to the sun's at sunrise.
-# Leaving them out makes steps that small, and a night four times as fast.
-DARK_BELOW_DEGREES = -20.0
+# A light this far down adds a hundredth of the night's own glow, and the moon's sky adds 1e-4 to the sun's at sunrise. Leaving them out
+# makes a night four times as fast; they fade out before, so that nothing jumps.
+FADE_IN_DEGREES = (-20.0, -18.0)
+MOON_FADE_OUT_DEGREES = (-2.0, 0.0)
 
 # ISO 2720: reflected-light meters with K = 12.5 expose a mean luminance L at EV100 = log2(L 100 / K).
 METER_CONSTANT = 12.5
@@ -56,9 +57,12 @@ def _make_lighting(location: Location, moment: datetime, weather: Weather) -> Li
     beams = np.zeros((2, 3))
     for number, (position, direction, spectrum) in enumerate(zip((sun, moon), directions, spectra, strict=True)):
         beams[number] = beam_irradiance(air, position.elevation_degrees, spectrum)
-        lost_in_daylight = position is moon and sun.elevation_degrees > 0
-        if position.elevation_degrees > DARK_BELOW_DEGREES and not lost_in_daylight:
-            sky += clear_sky(air, direction, spectrum, ground_albedo)
+        true = position.true_elevation_degrees
+        share = _smooth_step(*FADE_IN_DEGREES, true)
+        if position is moon:
+            share *= 1 - _smooth_step(*MOON_FADE_OUT_DEGREES, sun.elevation_degrees)
+        if share > 0:
+            sky += share * clear_sky(air, direction, spectrum, ground_albedo, true)
     sines = np.array([max(float(direction[1]), 0.0) for direction in directions])
     if weather.cloud_cover > 0:
         sky = with_clouds(sky, sines @ beams, weather.cloud_cover, weather.cloud_transmission)
@@ -83,8 +87,14 @@ def _make_lighting(location: Location, moment: datetime, weather: Weather) -> Li
     )
 
 
+def _smooth_step(low: float, high: float, value: float) -> float:
+    """From 0 up to low to 1 from high on, without a corner."""
+    share = min(max((value - low) / (high - low), 0.0), 1.0)
+    return share * share * (3 - 2 * share)
+
+
 def beam_irradiance(air: Atmosphere, elevation_degrees: float, spectrum: Float64) -> Float64:
-    """(3,) [lx]: a light's irradiance on a surface that faces it, through clear air; exactly 0 at and below the horizon."""
+    """(3,) [lx]: what a light gives to a surface that faces it, through clear air, by its elevation as seen; 0 from the horizon down."""
     return np.maximum(RGB_FROM_SPECTRUM @ (air.beam(elevation_degrees) * spectrum), 0.0)
 
 

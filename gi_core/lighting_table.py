@@ -12,14 +12,15 @@ from gi_core.spectrum import LUMINANCE_FROM_RGB
 from gi_core.sun import sun_position
 from gi_core.world import Location
 
-PLACE = Location(40.7484, -73.9857, 10.0, "UTC", source="given")
-# Published curves are means over many airs, and the values at one state differ by far more between authors: a tenth either side.
-SPREAD = 1.1
+# Where the sun comes within 14 degrees of the zenith on the table's day.
+PLACE = Location(20.0, 0.0, 0.0, "UTC", source="given")
+# The Explanatory Supplement's curve is itself good to 0.02 in the decimal logarithm, as its tables say; no other source says how good.
+SPREAD = 1.05
 
-# New moon on 2024-06-06: it stands below the horizon with the sun. Local noon and midnight in UTC.
-_NOON, _MIDNIGHT = datetime(2024, 6, 6, 17, tzinfo=UTC), datetime(2024, 6, 7, 5, tzinfo=UTC)
-# The full moon nearest to the winter solstice stands highest: 76 degrees.
-_FULL_MOON = datetime(2023, 12, 27, 5, tzinfo=UTC)
+# On 2024-04-05 the sun stands at its mean distance, as in the literature, and the moon, three days from new, goes down before it.
+_NOON, _MIDNIGHT = datetime(2024, 4, 5, 12, tzinfo=UTC), datetime(2024, 4, 6, 0, tzinfo=UTC)
+# A full moon at its mean distance, 66 degrees high.
+_FULL_MOON = datetime(2023, 4, 6, 0, tzinfo=UTC)
 
 
 @dataclass(frozen=True)
@@ -46,19 +47,21 @@ class Row:
         return max(self.model_lx / high, 1.0) * min(self.model_lx / low, 1.0)
 
 
-_USNO = "Janiczek and DeYoung 1987 (USNO Circular 171)"
-_IESNA = "IESNA Lighting Handbook, clear sky"
-_AMS = "AMS Glossary of Meteorology, twilight"
+_SUPPLEMENT = "Explanatory Supplement"
+_USNO = "USNO Circular 171"
+_IES = "IES 1984"
+_AMS = "AMS Glossary"
+# MATH.md says what each source is, and how it was checked.
 LITERATURE = {
-    "sun at 60 degrees": Measured(102e3, 104e3, f"{_IESNA}; {_USNO}"),
-    "sun at 5 degrees": Measured(4490, 6370, f"{_USNO}; {_IESNA}"),
-    "sun at 0 degrees": Measured(759, 800, f"{_USNO}; {_IESNA}"),
-    "sunset, -0.83 degrees": Measured(410, 585, _AMS),
-    "sun at -6 degrees": Measured(2, 4.3, f"{_AMS}; Kimball 1916"),
-    "sun at -12 degrees": Measured(0.008, 0.01, f"{_AMS}, and with airglow"),
-    "sun at -18 degrees": Measured(6e-4, 2e-3, f"{_AMS}, and with airglow"),
-    "full moon, high": Measured(0.05, 0.3, "Kyba, Mohar and Posch 2017"),
-    "new moon": Measured(6e-4, 2e-3, "Kyba, Mohar and Posch 2017; RCA Electro-Optics Handbook 1974"),
+    "sun at 60 degrees": Measured(101.9e3, 103.1e3, f"{_IES}; {_SUPPLEMENT}"),
+    "sun at 5 degrees": Measured(4250, 6370, f"{_USNO}; {_IES}"),
+    "sun at 0 degrees": Measured(759, 984, f"{_SUPPLEMENT}; {_USNO}"),
+    "sunset, -0.83 degrees": Measured(410, 670, f"{_AMS}; Kishida 1989"),
+    "sun at -6 degrees": Measured(2, 3.5, _AMS),
+    "sun at -12 degrees": Measured(0.0049, 0.0101, f"{_USNO}; {_SUPPLEMENT}, each with its own night"),
+    "sun at -18 degrees": Measured(5.1e-4, 2.64e-3, f"{_USNO}; {_SUPPLEMENT}, each with its own night"),
+    "full moon at 66 degrees": Measured(0.2, 0.32, "Spitschan et al. 2016; Kyba et al. 2017"),
+    "new moon": Measured(5e-4, 2e-3, f"{_USNO}; {_SUPPLEMENT}"),
 }
 
 
@@ -69,16 +72,11 @@ def illuminance(light: Lighting) -> float:
 
 
 def time_of_elevation(degrees: float) -> datetime:
-    """When on the table's evening the centre of the sun stands at an elevation of -24..72 degrees; to the second.
-
-    As in the literature's tables, elevations of 0 and more are apparent ones, with refraction, and others are true ones.
-    """
+    """When on the table's evening the sun's centre stands at a true elevation of -60..76 degrees, without refraction; to the second."""
     high, low = _NOON, _MIDNIGHT
     while low - high > timedelta(seconds=1):
         middle = high + (low - high) / 2
-        sun = sun_position(PLACE, middle)
-        now = sun.elevation_degrees if degrees >= 0 else sun.true_elevation_degrees
-        high, low = (middle, low) if now > degrees else (high, middle)
+        high, low = (middle, low) if sun_position(PLACE, middle).true_elevation_degrees > degrees else (high, middle)
     return low
 
 
@@ -92,7 +90,7 @@ def lighting_table() -> list[Row]:
         "sun at -6 degrees": time_of_elevation(-6.0),
         "sun at -12 degrees": time_of_elevation(-12.0),
         "sun at -18 degrees": time_of_elevation(-18.0),
-        "full moon, high": _FULL_MOON,
+        "full moon at 66 degrees": _FULL_MOON,
         "new moon": _MIDNIGHT,
     }
     return [Row(state, illuminance(make_lighting(PLACE, moment)), LITERATURE[state]) for state, moment in moments.items()]
@@ -102,8 +100,10 @@ def main() -> None:
     """Print the table as Markdown."""
     print("| clear sky | model [lx] | literature [lx] | source |\n|---|---|---|---|")
     for row in lighting_table():
-        found = row.literature
-        print(f"| {row.state} | {row.model_lx:.3g} | {found.low_lx:.3g} - {found.high_lx:.3g} | {found.source} |")
+        model, low, high = (
+            f"{lux:,.0f}" if lux >= 100 else f"{lux:.3g}" for lux in (row.model_lx, row.literature.low_lx, row.literature.high_lx)
+        )
+        print(f"| {row.state} | {model} | {low} - {high} | {row.literature.source} |")
 
 
 if __name__ == "__main__":

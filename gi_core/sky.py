@@ -11,8 +11,9 @@ import numpy as np
 from gi_core.air import EARTH_RADIUS_KM
 from gi_core.ambient_cube import FACE_DIRECTIONS
 from gi_core.arrays import Float64
-from gi_core.atmosphere import AEROSOL_ASYMMETRY, Atmosphere, SkyScattering
+from gi_core.atmosphere import Atmosphere, SkyScattering
 from gi_core.constants import SKY_SHAPE
+from gi_core.phase import aerosol_phase, air_phase
 from gi_core.spectrum import RGB_FROM_SPECTRUM
 
 ROWS, COLUMNS = SKY_SHAPE[0] // 2, SKY_SHAPE[1]
@@ -69,22 +70,24 @@ def cube_of_sky(sky: Float64) -> Float64:
     return np.asarray(_cube_weights() @ sky.reshape(-1, 3), np.float64)
 
 
-def clear_sky(air: Atmosphere, direction: Float64, spectrum: Float64, ground_albedo: float) -> Float64:
+def clear_sky(
+    air: Atmosphere, direction: Float64, spectrum: Float64, ground_albedo: float, true_elevation_degrees: float | None = None
+) -> Float64:
     """The map that a light (sun or moon) makes of clear air.
 
     direction : (3,), unit, world frame, towards the light; it may lie below the horizon
     spectrum : (8,), the light above the air, as shares of the sun's at 1 au
+    true_elevation_degrees : the light's without refraction, which the air above bends by itself; the direction's when None
     """
-    elevation = float(np.degrees(np.arcsin(np.clip(direction[1], -1, 1))))
+    elevation = true_elevation_degrees
+    if elevation is None:
+        elevation = float(np.degrees(np.arcsin(np.clip(direction[1], -1, 1))))
     parts = air.scattering(elevation, ground_albedo)
     rgb_from_share = RGB_FROM_SPECTRUM * spectrum
     cosine = np.clip(map_directions() @ direction, -1, 1)[..., None]
-    rayleigh = 3 / (16 * np.pi) * (1 + cosine * cosine)
-    g = AEROSOL_ASYMMETRY
-    aerosol = (1 - g * g) / (4 * np.pi) / (1 + g * g - 2 * g * cosine) ** 1.5  # Henyey and Greenstein
     air_map, aerosol_map, multiple_map = _around(parts, rgb_from_share, direction)
     # Deep sunset colours lie outside sRGB.
-    return np.maximum(air_map * rayleigh + aerosol_map * aerosol + multiple_map, 0.0)
+    return np.maximum(air_map * air_phase(cosine) + aerosol_map * aerosol_phase(cosine) + multiple_map, 0.0)
 
 
 def _around(parts: SkyScattering, rgb_from_share: Float64, direction: Float64) -> list[Float64]:

@@ -18,6 +18,8 @@ ALL_SNOW_BELOW_C, ALL_RAIN_ABOVE_C = -1.0, 3.0
 # 4 mm of water, some 4 cm of new snow, hide the ground but for a share of 1/e.
 HIDING_MM = 4.0
 DEEPEST_MM = 300.0
+# Beyond these there is no weather, and products of rates would leave the numbers that a computer has.
+WETTEST_MM_H, HOTTEST_C = 1e4, 1e3
 # Of new snow on level ground: 100 kg/m3, so 1 cm of it is 1 mm of water. Settled snow is denser, and hides no less.
 WATER_MM_PER_SNOW_CM = 1.0
 
@@ -33,11 +35,12 @@ class SnowRates:
 def snow_rates(precipitation_mm_h: float, temperature_c: float) -> SnowRates:
     """Rates under precipitation (rain and snow together, as water) at an air temperature; continuous in both.
 
-    Raises InputError for what is no number, and for negative precipitation.
+    Raises InputError for what is no number, for negative precipitation, and for what no weather reaches.
     """
-    if not (0 <= precipitation_mm_h < math.inf and math.isfinite(temperature_c)):
+    if not (0 <= precipitation_mm_h <= WETTEST_MM_H and -HOTTEST_C <= temperature_c <= HOTTEST_C):
         raise InputError(
-            f"snow: expected precipitation of 0 or more [mm/h] and a temperature [C], got {precipitation_mm_h}, {temperature_c}"
+            f"snow: expected precipitation of 0..{WETTEST_MM_H:g} mm/h and a temperature of {-HOTTEST_C:g}..{HOTTEST_C:g} C, "
+            f"got {precipitation_mm_h}, {temperature_c}"
         )
     share = min(max((ALL_RAIN_ABOVE_C - temperature_c) / (ALL_RAIN_ABOVE_C - ALL_SNOW_BELOW_C), 0.0), 1.0)
     warmth = max(temperature_c, 0.0)

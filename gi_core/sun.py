@@ -56,6 +56,14 @@ def refraction_degrees(true_elevation_degrees: float, pressure_mbar: float, temp
     return lift * fade * fade * (3 - 2 * fade)
 
 
+def without_refraction(elevation_degrees: float, pressure_mbar: float, temperature_c: float) -> float:
+    """The true elevation [degrees] of a light that is seen at an elevation: the inverse of adding ``refraction_degrees``."""
+    true = elevation_degrees
+    for _ in range(20):  # each step leaves a third of the error at most
+        true = elevation_degrees - refraction_degrees(true, pressure_mbar, temperature_c)
+    return true
+
+
 def pressure_at(elevation_m: float) -> float:
     """Mean air pressure [mbar] at a height above the sea."""
     return STANDARD_PRESSURE_MBAR * math.exp(-elevation_m / PRESSURE_SCALE_HEIGHT_M)

@@ -16,6 +16,7 @@ from gi_core.sky_image import read_image
 from gi_core.spectrum import LUMINANCE_FROM_RGB
 
 MOST_LUX = 1e7  # a hundred suns
+LEAST_LUX = 1e-9  # a millionth of a moonless night; far less is 0 in float32, and darkness has no exposure
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,11 +70,11 @@ def sky_of_image(
     found = float(LUMINANCE_FROM_RGB @ horizontal_illuminance(sky))
     if not found > 0:
         raise InputError(f"{where}: expected some light above the horizon, found none")
-    if illuminance_lx is not None and not 0 < illuminance_lx <= MOST_LUX:
-        raise InputError(f"{where}: expected an illuminance above 0 and up to {MOST_LUX:g} lx, got {illuminance_lx}")
+    if illuminance_lx is not None and not LEAST_LUX <= illuminance_lx <= MOST_LUX:
+        raise InputError(f"{where}: expected an illuminance of {LEAST_LUX:g}..{MOST_LUX:g} lx, got {illuminance_lx}")
     scale = 1.0 if illuminance_lx is None else illuminance_lx / found
-    if found * scale > MOST_LUX:
-        raise InputError(f"{where}: its {found:.3g} lx on level ground are beyond {MOST_LUX:g}; give an illuminance to scale it to")
+    if illuminance_lx is None and not LEAST_LUX <= found <= MOST_LUX:
+        raise InputError(f"{where}: its {found:.3g} lx on level ground are beyond {LEAST_LUX:g}..{MOST_LUX:g}; give one to scale it to")
     solid_angle = -np.diff(np.cos(np.pi * np.arange(SKY_SHAPE[0] + 1) / SKY_SHAPE[0]))
     light = solid_angle * (whole.sum(axis=1) @ LUMINANCE_FROM_RGB)
     radiance = np.zeros((*SKY_SHAPE, 3), np.float32)

@@ -116,7 +116,7 @@ def test_light_of_new_yorks_typical_year_is_tracked(new_york: EpwWeather) -> Non
             total += float(LUMINANCE_FROM_RGB @ (light.sky_cube[2] + light.sun.irradiance * max(light.sun.direction[1], 0))) / 3
         errors.append(total / year.global_lx[row] - 1)
         beams.append(beam - year.beam_lx[row])
-    # Seen over 200 hours: median 2.8 %, bias +0.3 %, 90th percentile 9 %; the hours' means against weather that is linear between them.
+    # Seen over 200 hours: median 2.3 %, bias 0.0 %, 90th percentile 8 %; the hours' means against weather that is linear between them.
     assert np.median(np.abs(errors)) < 0.05
     assert abs(np.median(errors)) < 0.03
     assert np.median(np.abs(beams)) < 3000
