@@ -6,6 +6,7 @@ A test compares the two, and ``Device`` asks the compiler for each record's size
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,8 @@ MAX_DIRECTIONAL_LIGHTS = 2
 # Sun visibility blends the four baked directions around the sun.
 PLANES_PER_LIGHT = 4
 VISIBILITY_CASES = 1 << PLANES_PER_LIGHT
+# Surfels whose bits share a uint.
+SURFELS_PER_WORD = 32
 # Values of LocalLight.kind.
 LOCAL_POINT, LOCAL_SPOT, LOCAL_AREA = range(3)
 # Shadow rays to an area light, one to the middle of each quarter; points and spots take one.
@@ -42,7 +45,7 @@ class Record:
     comment: str
     fields: tuple[tuple[str, str, int], ...]
 
-    @property
+    @cached_property
     def dtype(self) -> "np.dtype[Any]":
         """The same record in NumPy."""
         return np.dtype(
@@ -77,10 +80,21 @@ VOLUME_BOX = Record(
         ("sector_size", "int", 4),
     ),
 )
-SURFEL_PLACE = Record(
-    "SurfelPlace",
-    "Where a surfel is [m], sector-local, and its unit normal: what local lights need of it.",
-    (("position", "float", 3), ("padding_a", "float", 1), ("normal", "float", 3), ("padding_b", "float", 1)),
+SURFEL_WORD = Record(
+    "SurfelWord",
+    "Where 32 surfels are [m], sector-local, and their unit normals, by coordinate, and the box about them. A word of bits has as many.",
+    (
+        ("position_x", "float", SURFELS_PER_WORD),
+        ("position_y", "float", SURFELS_PER_WORD),
+        ("position_z", "float", SURFELS_PER_WORD),
+        ("normal_x", "float", SURFELS_PER_WORD),
+        ("normal_y", "float", SURFELS_PER_WORD),
+        ("normal_z", "float", SURFELS_PER_WORD),
+        ("low", "float", 3),
+        ("padding_a", "float", 1),
+        ("high", "float", 3),
+        ("padding_b", "float", 1),
+    ),
 )
 LOCAL_LIGHT = Record(
     "LocalLight",
@@ -100,7 +114,7 @@ LOCAL_LIGHT = Record(
 )
 SHADOW_TRIANGLE = Record(
     "ShadowTriangle",
-    "A corner and the two edges that leave it [m], sector-local.",
+    "A corner and the two edges that leave it [m], local to the sector that it lies in.",
     (
         ("corner", "float", 3),
         ("padding_a", "float", 1),
@@ -110,12 +124,23 @@ SHADOW_TRIANGLE = Record(
         ("padding_c", "float", 1),
     ),
 )
-RECORDS = (SURFEL, DIRECTIONAL_LIGHT, VOLUME_BOX, SURFEL_PLACE, LOCAL_LIGHT, SHADOW_TRIANGLE)
+SHADOW_NODE = Record(
+    "ShadowNode",
+    "A box about triangles [m]. skip: which node comes next for a ray that misses it. leaf: its first triangle * 8 + how many; 0 of a branch.",
+    (("low", "float", 3), ("skip", "uint", 1), ("high", "float", 3), ("leaf", "uint", 1)),
+)
+SHADOW_TILE = Record(
+    "ShadowTile",
+    "One sector's nodes and triangles, where they are. offset [m]: from the lit sector's coordinates to its own.",
+    (("offset", "float", 3), ("first_node", "uint", 1), ("end_node", "uint", 1), ("first_triangle", "uint", 1), ("padding", "uint", 2)),
+)
+RECORDS = (SURFEL, DIRECTIONAL_LIGHT, VOLUME_BOX, SURFEL_WORD, LOCAL_LIGHT, SHADOW_TRIANGLE, SHADOW_NODE, SHADOW_TILE)
 CONSTANTS: dict[str, int | float] = {
     "MAX_DIRECTIONAL_LIGHTS": MAX_DIRECTIONAL_LIGHTS,
     "PLANES_PER_LIGHT": PLANES_PER_LIGHT,
     "VISIBILITY_CASES": VISIBILITY_CASES,
     "SNOW_ALBEDO": SNOW_ALBEDO,
+    "SURFELS_PER_WORD": SURFELS_PER_WORD,
     "LOCAL_POINT": LOCAL_POINT,
     "LOCAL_SPOT": LOCAL_SPOT,
     "LOCAL_AREA": LOCAL_AREA,

@@ -16,8 +16,9 @@ from gi_core.grid import SectorIndex
 from gi_core.layout import SHADOW_END_M, SHADOW_START_M
 from gi_core.light_geometry import ShadowGeometry
 from gi_core.light_plan import SurfelBounds, touching_lamps
-from gi_core.light_surfels import SurfelLights, shadow_triangles, surfel_places
+from gi_core.light_surfels import SurfelLights
 from gi_core.lights import light_records
+from gi_core.lights_twin import shadow_triangles, surfel_places
 from gi_core.spectrum import LUMINANCE_FROM_RGB
 from gi_core.world import Lamp
 
@@ -345,11 +346,11 @@ def test_a_lamp_that_flickers_keeps_its_shadows_and_one_that_moves_does_not(devi
     lamps = random_lamps(rng, 40)
     lit = SurfelLights(device, sector, shadows)
     lit.set_dynamic(lamps)
-    held, bits = lit.nbytes, [traced.shadow_bits for traced in lit._dynamic.traced]
-    assert len(bits) == 2
+    held, planes = lit.nbytes, [shadow.plane for shadow in lit._dynamic.shadows if shadow]
+    assert len(planes) > 30
     dimmed = [replace(lamp, lumens=lamp.lumens * 0.3, color=(0.2, 0.9, 0.4)) for lamp in lamps]
     lit.set_dynamic(dimmed)
-    assert [traced.shadow_bits for traced in lit._dynamic.traced] == bits
+    assert [shadow.plane for shadow in lit._dynamic.shadows if shadow] == planes
     assert read(device, lit, sector).tobytes() == light_of(device, sector, dimmed, shadows).tobytes()
     with pytest.raises(InputError, match="lumens"):
         lit.set_dynamic([replace(lamp, lumens=-1.0) for lamp in lamps])
