@@ -8,7 +8,7 @@ import numpy as np
 from gi_core.arrays import AnyArray, Float32, Float64
 from gi_core.layout import SURFEL_WORD, SURFELS_PER_WORD
 from gi_core.lights import area_halves, check_lamp
-from gi_core.sector import Sector, counts
+from gi_core.sector import Sector
 from gi_core.world import Lamp
 
 # Records of one launch lie in constant memory, of which a device has 64 kB at least: 12 kB.
@@ -53,20 +53,18 @@ class SurfelBounds:
 
         It holds whole bricks, and so a little more than it must.
         """
-        beyond = position[:, None] - np.minimum(np.maximum(position[:, None], self._low), self._high)
-        squared = _squares(beyond)
+        at = position[:, None]
+        squared = _squares(at - np.minimum(np.maximum(at, self._low), self._high))
         bricks = np.flatnonzero(squared < distance_m**2)
-        if not len(bricks) or not self._any_within(bricks[[squared[bricks].argmin()]], position, distance_m):
-            if not self._any_within(bricks, position, distance_m):
-                return None
-        low, high = self._low[:, bricks].min(axis=1), self._high[:, bricks].max(axis=1)
+        if not len(bricks):
+            return None
+        # Nearly always the closest brick has one.
+        closest = int(squared.argmin())
+        some = self._position[:, self._brick_starts[closest] : self._brick_starts[closest + 1]] - at
+        if not (_squares(some) < distance_m**2).any() and not (_squares(self._position - at) < distance_m**2).any():
+            return None
+        low, high = self._low.take(bricks, axis=1).min(axis=1), self._high.take(bricks, axis=1).max(axis=1)
         return np.maximum(low, position - distance_m), np.minimum(high, position + distance_m)
-
-    def _any_within(self, bricks: AnyArray, position: Float64, distance_m: float) -> bool:
-        chosen = np.zeros(len(self._brick_starts) - 1, bool)
-        chosen[bricks] = True
-        near = self._position[:, np.repeat(chosen, counts(self._brick_starts))] - position[:, None]
-        return bool((_squares(near) < distance_m**2).any())
 
 
 def touching_lamps(lamps: Sequence[Lamp], surfels: SurfelBounds) -> tuple[TouchingLamp, ...]:
@@ -105,10 +103,9 @@ def changed_spheres(before: Sequence[Lamp], after: Sequence[Lamp], origin: Float
         changed = [*before[head : len(before) - tail], *after[head : len(after) - tail]]
     if not changed or len(changed) > MAX_CHANGED:
         return None
-    spheres = np.zeros((len(changed), 4), np.float32)
-    spheres[:, :3] = np.array([lamp.position for lamp in changed], np.float64) - origin
-    spheres[:, 3] = [lamp.range_m for lamp in changed]
-    return spheres
+    x, y, z = origin.tolist()
+    spheres = [(lamp.position[0] - x, lamp.position[1] - y, lamp.position[2] - z, lamp.range_m) for lamp in changed]
+    return np.array(spheres, np.float32)
 
 
 def surfel_words(sector: Sector) -> AnyArray:

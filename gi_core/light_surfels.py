@@ -9,9 +9,10 @@ import pyopencl as cl
 
 from gi_core.arrays import AnyArray, Float32
 from gi_core.device import Device
-from gi_core.layout import AREA_SHADOW_RAYS, LOCAL_LIGHT, SURFELS_PER_WORD
+from gi_core.grid import SectorIndex
+from gi_core.layout import AREA_SHADOW_RAYS, LOCAL_AREA, LOCAL_LIGHT, SURFELS_PER_WORD
 from gi_core.light_geometry import ShadowGeometry
-from gi_core.light_plan import MAX_LIGHTS_PER_LAUNCH, SurfelBounds, TouchingLamp, changed_spheres, surfel_words, touching_lamps
+from gi_core.light_plan import MAX_LIGHTS_PER_LAUNCH, SurfelBounds, changed_spheres, surfel_words, touching_lamps
 from gi_core.lights import check_lamp, light_records
 from gi_core.sector import Sector
 from gi_core.shadow_bits import Shadow, ShadowBits
@@ -89,6 +90,7 @@ class SurfelLights:
     def _sum_all(self, changed: Float32 | None) -> None:
         if not len(self._static.records) and not len(self._dynamic.records):
             self.buffer = self._places = None
+            self._bits.clear()
             return
         if self.buffer is None:
             self.buffer, changed = self._allocate(), None
@@ -112,56 +114,46 @@ class SurfelLights:
         touching = self._touching([given[i] for i in unknown])
 
         self._bits.keep({*others.shadows, *shadows})
-        untraced = []
-        for found in touching:
-            shadow = self._bits.find(found.lamp)  # there is one when the same list has two lamps that stand alike
-            if shadow is None:
-                shadow = self._bits.add(found.lamp)
-                untraced.append((found, shadow))
-            shadows[unknown[found.index]] = shadow
-        self._trace(untraced)
-        return _Lit(given, tuple(shadows), self._records(before, was, given, shadows))
+        untraced: dict[int, list[SectorIndex]] = {}
+        for number, about in touching.items():
+            i = unknown[number]
+            shadows[i] = self._bits.find(given[i])  # there is one when the same list has two lamps that stand alike
+            if shadows[i] is None:
+                shadows[i] = self._bits.add(given[i])
+                untraced[i] = about
+        planes = {i: shadow.plane for i in arrived if (shadow := shadows[i]) is not None}
+        records = light_records([given[i] for i in planes], self._sector.index.origin)
+        records["first_plane"] = list(planes.values())
+        self._trace(records[[i in untraced for i in planes]], list(untraced.values()))
+        return _Lit(given, tuple(shadows), _in_order(before, was, shadows, records))
 
-    def _touching(self, lamps: Sequence[Lamp]) -> tuple[TouchingLamp, ...]:
+    def _touching(self, lamps: Sequence[Lamp]) -> dict[int, list[SectorIndex]]:
+        """Which of the lamps touch, and for each the sectors whose triangles may shadow it. Those have been read when this returns."""
         if not lamps:
-            return ()
+            return {}
         self._bounds = self._bounds or SurfelBounds(self._sector)
-        touching = touching_lamps(lamps, self._bounds)
-        for found in touching:
-            for index in self._geometry.sectors_in(found.low, found.high):
-                self._geometry.tree(index)
+        touching = {found.index: self._geometry.sectors_in(found.low, found.high) for found in touching_lamps(lamps, self._bounds)}
+        for index in {index for about in touching.values() for index in about}:
+            self._geometry.tree(index)
         return touching
 
-    def _records(self, before: _Lit, was: list[int], given: tuple[Lamp, ...], shadows: list[Shadow | None]) -> AnyArray:
-        """Records of the lamps that touch, in order: those of before where they are the same lamps."""
-        row = count()
-        rows = [next(row) if shadow is not None else -1 for shadow in before.shadows]
-        touching = [(at, lamp, shadow) for at, lamp, shadow in zip(was, given, shadows, strict=True) if shadow is not None]
-        new = light_records([lamp for at, lamp, _ in touching if at < 0], self._sector.index.origin)
-        new["first_plane"] = [shadow.plane for at, _, shadow in touching if at < 0]
-        number = count(len(before.records))
-        chosen = [next(number) if at < 0 else rows[at] for at, _, _ in touching]
-        return np.concatenate([before.records, new])[chosen] if chosen else new
-
-    def _trace(self, untraced: Sequence[tuple[TouchingLamp, Shadow]]) -> None:
-        """Enqueue the tracing of shadows: each lamp against the triangles of the sectors about it."""
-        device, here, tiles = self._device, self._sector.index, self._geometry.on_device(self._device)
-        for first in range(0, len(untraced), MAX_LIGHTS_PER_LAUNCH):
-            some = untraced[first : first + MAX_LIGHTS_PER_LAUNCH]
-            records = light_records([found.lamp for found, _ in some], here.origin)
-            records["first_plane"] = [shadow.plane for _, shadow in some]
-            planes = [light * AREA_SHADOW_RAYS + ray for light, (_, shadow) in enumerate(some) for ray in range(shadow.planes)]
-            about = [self._geometry.sectors_in(found.low, found.high) for found, _ in some]
-            lights, plane_buffer, bits = device.upload(records), device.upload(np.array(planes, np.uint32)), self._bits.ready()
-            for again, (group, nodes, triangles) in enumerate(tiles.groups({index for near in about for index in near})):
-                chosen = [[index for index in near if index in group] for near in about]
+    def _trace(self, records: AnyArray, about: Sequence[list[SectorIndex]]) -> None:
+        """Enqueue the tracing of lamps' shadows (n,) layout.LOCAL_LIGHT, each against the triangles of the sectors about it."""
+        device, tiles = self._device, self._geometry.on_device(self._device)
+        for first in range(0, len(records), MAX_LIGHTS_PER_LAUNCH):
+            some, near = records[first : first + MAX_LIGHTS_PER_LAUNCH], about[first : first + MAX_LIGHTS_PER_LAUNCH]
+            rays = np.where(some["kind"] == LOCAL_AREA, AREA_SHADOW_RAYS, 1)
+            planes = [light * AREA_SHADOW_RAYS + ray for light, count in enumerate(rays.tolist()) for ray in range(count)]
+            lights, plane_buffer, bits = device.upload(some), device.upload(np.array(planes, np.uint32)), self._bits.ready()
+            for again, (group, nodes, triangles) in enumerate(tiles.groups({index for indices in near for index in indices})):
+                chosen = [[index for index in indices if index in group] for indices in near]
                 arguments = [
                     np.uint32(self._words),
                     self._surfel_places(),
                     lights,
                     plane_buffer,
                     device.upload(np.cumsum([0, *map(len, chosen)]).astype(np.uint32)),
-                    device.upload(tiles.records([index for near in chosen for index in near], here)),
+                    device.upload(tiles.records([index for indices in chosen for index in indices], self._sector.index)),
                     nodes,
                     triangles,
                     np.uint32(again),
@@ -203,3 +195,13 @@ class SurfelLights:
         if self._places is None:
             self._places = self._device.upload(surfel_words(self._sector))
         return self._places
+
+
+def _in_order(before: _Lit, was: Sequence[int], shadows: Sequence[Shadow | None], arrived: AnyArray) -> AnyArray:
+    """Records of the lamps that touch: from before where ``was`` tells a lamp's place there, else the next of those that arrived."""
+    row = count()
+    old = [next(row) if shadow is not None else -1 for shadow in before.shadows]
+    rows = [next(row) if at < 0 else old[at] for at, shadow in zip(was, shadows, strict=True) if shadow is not None]
+    # As bytes: NumPy compares the types of records field by field, which takes longer than all the rest.
+    both = np.concatenate([records.view(np.uint8).reshape(-1, LOCAL_LIGHT.dtype.itemsize) for records in (before.records, arrived)])
+    return both[rows].view(LOCAL_LIGHT.dtype)[:, 0] if rows else arrived

@@ -30,7 +30,7 @@ def stand_of(lamp: Lamp) -> Stand:
 
 
 class ShadowBits:
-    """One buffer of planes (n, words) uint32. It grows by doubling and goes when the last shadow has gone."""
+    """One buffer of planes (n, words) uint32. It grows by doubling."""
 
     def __init__(self, device: Device, words: int) -> None:
         self.buffer: cl.Buffer | None = None
@@ -65,7 +65,11 @@ class ShadowBits:
             del self._shadows[shadow.stand]
             self._free.setdefault(shadow.planes, []).append(shadow.plane)
         if not self._shadows:
-            self.buffer, self._used, self._free = None, 0, {}
+            self._used, self._free = 0, {}
+
+    def clear(self) -> None:
+        """Give all back, and the buffer with it."""
+        self.buffer, self._used, self._free, self._shadows = None, 0, {}, {}
 
     def ready(self) -> cl.Buffer:
         """The buffer, with room for all that was added; what it held is in it still."""

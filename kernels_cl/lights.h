@@ -40,6 +40,14 @@ inline uint bits_of(int8 lanes)
     return (uint)(four.x | four.y | four.z | four.w);
 }
 
+// Whether any lane is on; PoCL's any() goes lane by lane.
+inline int some_of(int8 lanes)
+{
+    const int4 four = lanes.lo | lanes.hi;
+    const int2 two = four.lo | four.hi;
+    return (two.x | two.y) != 0;
+}
+
 // The least and the greatest of 0 and the lanes that are on.
 inline float least_of(float8 value, int8 on)
 {

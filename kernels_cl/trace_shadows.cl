@@ -20,6 +20,9 @@
 // Rays that meet an edge exactly must not slip between the two triangles that share it.
 #define EDGE_SLACK 1e-5f
 #define DEGENERATE 1e-12f
+// One instruction each, where fmin and fmax are three for the sake of NaN, of which there is none.
+#define LESSER(a, b) ((a) < (b) ? (a) : (b))
+#define LARGER(a, b) ((a) > (b) ? (a) : (b))
 // Ways this short along an axis stand for parallel to it; what divides by them stays finite.
 #define SHORTEST_WAY 1e-25f
 
@@ -42,9 +45,9 @@ inline int meets(const Rays *rays, float3 low, float3 high)
     const float8 x0 = low.x * rays->inverse_x, x1 = high.x * rays->inverse_x;
     const float8 y0 = low.y * rays->inverse_y, y1 = high.y * rays->inverse_y;
     const float8 z0 = low.z * rays->inverse_z, z1 = high.z * rays->inverse_z;
-    const float8 enters = fmax(fmax(fmin(x0, x1), fmin(y0, y1)), fmax(fmin(z0, z1), 0.0f));
-    const float8 leaves = fmin(fmin(fmax(x0, x1), fmax(y0, y1)), fmin(fmax(z0, z1), 1.0f));
-    return any((enters <= leaves) & rays->open);
+    const float8 enters = LARGER(LARGER(LESSER(x0, x1), LESSER(y0, y1)), LARGER(LESSER(z0, z1), (float8)(0.0f)));
+    const float8 leaves = LESSER(LESSER(LARGER(x0, x1), LARGER(y0, y1)), LESSER(LARGER(z0, z1), (float8)(1.0f)));
+    return some_of((enters <= leaves) & rays->open);
 }
 
 // Which rays a triangle blocks, -1 where it does. Moller and Trumbore, "Fast, minimum storage ray/triangle intersection", 1997. Both
@@ -82,7 +85,7 @@ inline void walk(Rays *rays, uint groups, float3 least, float3 most, float3 lamp
             for (uint g = 0; g < GROUPS; ++g)
                 if (met >> g & 1) {
                     rays[g].open &= ~blocks(rays + g, from_corner, edge_a, edge_b);
-                    if (!any(rays[g].open))
+                    if (!some_of(rays[g].open))
                         groups &= ~(1u << g);
                 }
             if (!groups)
@@ -134,7 +137,7 @@ __kernel void trace_shadows(
         // As close to the lamp as this there is nothing in between.
         r->open = reached & (length > SHADOW_END_M);
         unhidden |= bits_of(reached & ~r->open) << (LANES * g);
-        if (!any(r->open))
+        if (!some_of(r->open))
             continue;
         groups |= 1u << g;
         r->ends = SHADOW_END_M / length;
@@ -149,7 +152,7 @@ __kernel void trace_shadows(
         walk(rays, groups, least, most, target + LOAD3(tile->offset), nodes + tile->first_node, tile->end_node - tile->first_node,
              triangles + tile->first_triangle);
         for (uint g = 0; g < GROUPS; ++g)
-            if ((groups >> g & 1) && !any(rays[g].open))
+            if ((groups >> g & 1) && !some_of(rays[g].open))
                 groups &= ~(1u << g);
     }
     for (uint g = 0; g < GROUPS; ++g)
