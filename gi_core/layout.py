@@ -126,7 +126,7 @@ SHADOW_TRIANGLE = Record(
 )
 SHADOW_NODE = Record(
     "ShadowNode",
-    "A box about triangles [m]. skip: which node comes next for a ray that misses it. leaf: its first triangle * 8 + how many; 0 of a branch.",
+    "A box about triangles [m]. skip: the next node for a ray that misses it. leaf: its first triangle * 8 + how many; 0 of a branch.",
     (("low", "float", 3), ("skip", "uint", 1), ("high", "float", 3), ("leaf", "uint", 1)),
 )
 SHADOW_TILE = Record(

@@ -79,7 +79,7 @@ typedef struct {
     float padding_c;
 } ShadowTriangle;
 
-// A box about triangles [m]. skip: which node comes next for a ray that misses it. leaf: its first triangle * 8 + how many; 0 of a branch.
+// A box about triangles [m]. skip: the next node for a ray that misses it. leaf: its first triangle * 8 + how many; 0 of a branch.
 typedef struct {
     float low[3];
     uint skip;
