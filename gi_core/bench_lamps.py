@@ -56,7 +56,9 @@ def bench_lamps(device: Device, quick: bool = False) -> list[Measurement]:
 
     triangles = len(lights_twin.shadow_triangles(shadows, touching_lamps(lamps[:1], bounds)[0], sector.index.origin))
     sizes = {"lamps": 1, "surfels": sector.surfel_count, "triangles": triangles}
-    moved = _row("lamp_moved", side_by_side(move, twin, 1 if quick else 7, calls=20), sizes, device, "NumPy twin, every triangle near the lamp")
+    moved = _row(
+        "lamp_moved", side_by_side(move, twin, 1 if quick else 7, calls=20), sizes, device, "NumPy twin, every triangle near the lamp"
+    )
     if quick:
         return [moved]
 
@@ -86,7 +88,9 @@ def _row(name: str, seconds: tuple[float, float], sizes: dict[str, int], device:
 def _boxes(rng: np.random.Generator) -> tuple[Float64, Float64]:
     """Lowest and highest corners (n, 3) [m], sector-local, of houses."""
     low = rng.uniform(0, SECTOR_SIZE_M - 14, (BOXES_PER_SECTOR, 3)) * (1, 0, 1)
-    return low, low + np.column_stack([rng.uniform(4, 14, low.shape[0]), rng.uniform(5, 60, low.shape[0]), rng.uniform(4, 14, low.shape[0])])
+    return low, low + np.column_stack(
+        [rng.uniform(4, 14, low.shape[0]), rng.uniform(5, 60, low.shape[0]), rng.uniform(4, 14, low.shape[0])]
+    )
 
 
 def _geometry(index: SectorIndex, low: Float64, high: Float64) -> Geometry:
