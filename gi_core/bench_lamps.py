@@ -16,7 +16,7 @@ from gi_core.light_geometry import ShadowGeometry
 from gi_core.light_plan import SurfelBounds, touching_lamps
 from gi_core.light_surfels import SurfelLights
 from gi_core.lights import light_records
-from gi_core.sector import Sector
+from gi_core.sector import Sector, counts
 from gi_core.world import Lamp
 
 BOXES_PER_SECTOR = 40  # 400 triangles; Midtown has 300 to 600
@@ -115,7 +115,7 @@ def _sector(rng: np.random.Generator, low: Float64, high: Float64) -> Sector:
     order = np.lexsort((axis, box))
     box, axis, side = box[order], axis[order], side[order]
     patch = low[box] + rng.uniform(0, 1, (bricks, 3)) * np.maximum(high[box] - low[box] - _BRICK_M, 0)
-    of_surfel = np.repeat(np.arange(bricks), np.diff(sector.brick_starts.astype(np.int64)))
+    of_surfel = np.repeat(np.arange(bricks), counts(sector.brick_starts))
     position = patch[of_surfel] + rng.uniform(0, _BRICK_M, (len(of_surfel), 3))
     on_face = np.where(side == 1, high[box, axis], low[box, axis])[of_surfel]
     np.put_along_axis(position, axis[of_surfel, None], on_face[:, None], axis=1)

@@ -40,7 +40,6 @@ class SurfelBounds:
         self.origin = sector.index.origin
         # By coordinate: NumPy's sums over a long axis are some times faster than over one of three.
         self._position = np.ascontiguousarray(sector.surfel_position.T, np.float64)
-        self._brick_starts = sector.brick_starts
         first = sector.brick_starts[:-1].astype(np.int64)
         empty = np.zeros((3, 0))
         self._low = np.minimum.reduceat(self._position, first, axis=1) if len(first) else empty
@@ -58,12 +57,12 @@ class SurfelBounds:
         bricks = np.flatnonzero(squared < distance_m**2)
         if not len(bricks):
             return None
-        # Nearly always the closest brick has one.
-        closest = int(squared.argmin())
-        some = self._position[:, self._brick_starts[closest] : self._brick_starts[closest + 1]] - at
-        if not (_squares(some) < distance_m**2).any() and not (_squares(self._position - at) < distance_m**2).any():
+        low, high = self._low.take(bricks, axis=1), self._high.take(bricks, axis=1)
+        # Nearly always some brick is in range to its farthest corner; only where none is, surfels are looked at.
+        whole = _squares(np.maximum(at - low, high - at)) < distance_m**2
+        if not whole.any() and not (_squares(self._position - at) < distance_m**2).any():
             return None
-        low, high = self._low.take(bricks, axis=1).min(axis=1), self._high.take(bricks, axis=1).max(axis=1)
+        low, high = low.min(axis=1), high.max(axis=1)
         return np.maximum(low, position - distance_m), np.minimum(high, position + distance_m)
 
 
