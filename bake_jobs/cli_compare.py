@@ -10,6 +10,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from bake_jobs.compare import choose_sectors, compare_dataset
 from bake_jobs.compare_report import draw_chart, report_table, write_json
+from bake_jobs.lamp_file import load_lamps
 from bake_jobs.scene_source import load_scene
 from gi_core.container import write_atomic
 from gi_core.dataset import Dataset
@@ -28,17 +29,22 @@ def run(
     samples: int,
     seed: int,
     source: str | None,
+    lamps_path: Path | None,
     json_path: Path | None,
     plot_path: Path | None,
     device: str | None,
 ) -> None:
-    """Measure, print the table on stdout, and write what was asked for. Raises as ``compare_dataset`` and ``load_scene`` do."""
+    """Measure, print the table on stdout, and write what was asked for.
+
+    Raises as ``compare_dataset``, ``load_lamps`` and ``load_scene`` do.
+    """
     if plot_path is not None and plot_path.suffix.lower() != ".png":
         raise InputError(f"--plot {plot_path}: expected a name that ends in .png")
     for path in (json_path, plot_path):
         # An hour of path tracing must not be lost to a typing mistake.
         if path is not None and (path.is_dir() or not path.absolute().parent.is_dir()):
             raise InputError(f"{path}: expected a file in a folder that exists")
+    lamps = None if lamps_path is None else load_lamps(lamps_path)
     scene = None if source is None else load_scene(source)
     with Progress(
         TextColumn("comparing"),
@@ -65,6 +71,7 @@ def run(
             seed=seed,
             device=device,
             scene=scene,
+            lamps=lamps,
             progress=advance,
         )
     console = Console()

@@ -76,6 +76,7 @@ def compare_dataset(
     seed: int = 0,
     device: str | None = None,
     scene: Scene | None = None,
+    lamps: Sequence[Lamp] | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Measure a dataset's error; the same arguments give the same report.
@@ -87,6 +88,7 @@ def compare_dataset(
     points_per_sector : of each kind; samples : paths per reference value; seed : of both
     device : OpenCL device, as Engine takes it
     scene : the source's triangles, wanted when the bake left out what surrounds these sectors; otherwise the dataset's are used
+    lamps : lit with these instead of the dataset's own
     progress : called with (steps done, steps in all, what was done)
 
     Returns
@@ -104,6 +106,7 @@ def compare_dataset(
     moments = parse_states(states, world.location)
     chosen = list(sectors) if sectors is not None else choose_sectors(dataset, seed)
     engine = Engine(dataset, device)
+    engine.lamps = world.lamps if lamps is None else tuple(lamps)
     lightings = {state.name: engine.lighting(state.time, state.weather) for state in moments}
     tracer = _tracer(dataset, chosen, scene)
     found = {state: {stage: StageSamples() for stage in STAGES} for state in lightings}
@@ -118,7 +121,7 @@ def compare_dataset(
                 air["open"] += int(known.sum())
                 air["called_solid"] += int((known & (volume.mask < VOXEL_OUTDOORS)).sum())
             stages = found[state]
-            reference = Reference(tracer, lighting, lamps_on(world.lamps, lighting), samples, _rng(seed, index, lighting.digest))
+            reference = Reference(tracer, lighting, lamps_on(engine.lamps, lighting), samples, _rng(seed, index, lighting.digest))
             stages["probes"].add(engine.lit_sector(index, lighting)[points.probe], reference.cubes(points.probe_position))
             _compare_voxels(stages["near"], volume, points.near, reference)
             _compare_voxels(stages["mid"], volume, points.mid, reference)
@@ -132,6 +135,7 @@ def compare_dataset(
         "basis": world.basis,
         "states": {state: {stage: summarise(stages[stage]) for stage in STAGES} for state, stages in found.items()},
         "moments": {state.name: {"time": lightings[state.name].time, "weather": state.weather} for state in moments},
+        "lamps_on": {state: len(lamps_on(engine.lamps, lighting)) for state, lighting in lightings.items()},
         "sectors": [[index.x, index.z] for index in chosen],
         "dataset": world.bake_id,
         "points_per_sector": points_per_sector,

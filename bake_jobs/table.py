@@ -1,7 +1,9 @@
 """Reading one TOML table by name and type, with errors that say which table and key; keys nobody asked for are refused."""
 
 import math
+import tomllib
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from gi_core.errors import SourceError
@@ -85,6 +87,16 @@ class Table:
 
     def _wrong(self, key: str, expected: str, found: Any) -> SourceError:
         return SourceError(f"{self.where}: {key}: expected {expected}, found {found!r}")
+
+
+def read_toml(path: Path) -> Table:
+    """A file's top table. Raises SourceError when it cannot be read or is no TOML."""
+    try:
+        return Table(tomllib.loads(path.read_text(encoding="utf-8")), str(path))
+    except (ValueError, RecursionError) as error:
+        raise SourceError(f"{path}: expected TOML ({error})") from error
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be read ({error.strerror})") from error
 
 
 def _is_number(value: Any) -> bool:

@@ -40,7 +40,6 @@ spacing_m = 2.0
 """
 
 import dataclasses
-import tomllib
 import zoneinfo
 from collections.abc import Callable
 from datetime import date, datetime
@@ -49,23 +48,11 @@ from pathlib import Path
 import numpy as np
 
 from bake_jobs.geography import MapFrame, timezone_at
+from bake_jobs.lamp_file import read_lamp
 from bake_jobs.scene import Mesh, ProbeHint, SourceContent, join_meshes
-from bake_jobs.table import Table
-from gi_core.errors import InputError, SourceError
-from gi_core.lights import (
-    MAX_CONE_DEGREES,
-    MAX_LUMENS,
-    MAX_RANGE_M,
-    MAX_SIZE_M,
-    MAX_TEMPERATURE_K,
-    MIN_CONE_DEGREES,
-    MIN_RANGE_M,
-    MIN_SIZE_M,
-    MIN_TEMPERATURE_K,
-    check_lamp,
-    color_from_temperature,
-)
-from gi_core.world import LAMP_KINDS, Lamp, Location, Room
+from bake_jobs.table import Table, read_toml
+from gi_core.errors import SourceError
+from gi_core.world import Location, Room
 
 HINT_KINDS = ("add", "forbid")
 MAX_ROOMS = 65_535  # a sector stores room numbers as uint16, and 0 is outdoors
@@ -74,12 +61,7 @@ Loader = Callable[[Path, MapFrame | None], SourceContent]
 
 def load_world_file(path: Path, load: Loader) -> SourceContent:
     """Read a world.toml and, with ``load``, the sources it names. Raises SourceError naming the key that is wrong."""
-    try:
-        top = Table(tomllib.loads(path.read_text(encoding="utf-8")), str(path))
-    except (ValueError, RecursionError) as error:
-        raise SourceError(f"{path}: expected TOML ({error})") from error
-    except OSError as error:
-        raise SourceError(f"{path}: cannot be read ({error.strerror})") from error
+    top = read_toml(path)
     name = top.text("name", path.stem)
     north = top.number("north_degrees", 0.0, -360.0, 360.0)
     given = top.table("location")
@@ -87,7 +69,7 @@ def load_world_file(path: Path, load: Loader) -> SourceContent:
     frame = MapFrame(location.latitude_degrees, location.longitude_degrees, north) if location else None
     sources = [_source(table, path.parent, frame, north, load) for table in top.tables("source")]
     rooms = tuple(_room(table) for table in top.tables("room"))
-    lamps = tuple(_lamp(table) for table in top.tables("lamp"))
+    lamps = tuple(read_lamp(table) for table in top.tables("lamp"))
     hints = tuple(_hint(table) for table in top.tables("hint"))
     top.refuse_unknown()
     if not sources:
@@ -139,31 +121,6 @@ def _room(table: Table) -> Room:
     minimum, maximum = _box(table)
     table.refuse_unknown()
     return Room(name, minimum, maximum)
-
-
-def _lamp(table: Table) -> Lamp:
-    if "temperature_k" in table and "color" in table:
-        raise SourceError(f"{table.where}: expected color or temperature_k, found both")
-    temperature = table.number("temperature_k", 6500.0, MIN_TEMPERATURE_K, MAX_TEMPERATURE_K)
-    by_temperature = color_from_temperature(temperature) if "temperature_k" in table else None
-    lamp = Lamp(
-        table.text("name", None),
-        table.choice("kind", LAMP_KINDS, "point"),
-        table.vector("position", None),
-        table.number("lumens", None, 0.0, MAX_LUMENS),
-        by_temperature or table.vector("color", Lamp.color, 0.0, 1e6),
-        table.number("range_m", Lamp.range_m, MIN_RANGE_M, MAX_RANGE_M),
-        table.vector("direction", Lamp.direction),
-        table.number("cone_degrees", Lamp.cone_degrees, MIN_CONE_DEGREES, MAX_CONE_DEGREES),
-        table.pair("size", Lamp.size, MIN_SIZE_M, MAX_SIZE_M),
-        table.text("schedule", Lamp.schedule),
-    )
-    table.refuse_unknown()
-    try:
-        check_lamp(lamp)
-    except InputError as error:
-        raise SourceError(f"{table.where}: {error}") from error
-    return lamp
 
 
 def _hint(table: Table) -> ProbeHint:

@@ -6,6 +6,7 @@ A test compares the two, and ``Device`` asks the compiler for each record's size
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,8 @@ PLANES_PER_LIGHT = 4
 ROW_BITS, ROW_ONE = 0x7FFFFF, 0x3F800000
 # A surfel's sample of the sun's shadow map is a share of this; NO_SAMPLE stands for none.
 WHOLE_SAMPLE, NO_SAMPLE = 254, 255
+# Surfels whose bits share a uint.
+SURFELS_PER_WORD = 32
 # Values of LocalLight.kind.
 LOCAL_POINT, LOCAL_SPOT, LOCAL_AREA = range(3)
 # Shadow rays to an area light, one to the middle of each quarter; points and spots take one.
@@ -49,7 +52,7 @@ class Record:
     comment: str
     fields: tuple[tuple[str, str, int], ...]
 
-    @property
+    @cached_property
     def dtype(self) -> "np.dtype[Any]":
         """The same record in NumPy."""
         return np.dtype(
@@ -83,10 +86,21 @@ VOLUME_BOX = Record(
         ("sector_size", "int", 4),
     ),
 )
-SURFEL_PLACE = Record(
-    "SurfelPlace",
-    "Where a surfel is [m], sector-local, and its unit normal: what local lights need of it.",
-    (("position", "float", 3), ("padding_a", "float", 1), ("normal", "float", 3), ("padding_b", "float", 1)),
+SURFEL_WORD = Record(
+    "SurfelWord",
+    "Where 32 surfels are [m], sector-local, and their unit normals, by coordinate, and the box about them. A word of bits has as many.",
+    (
+        ("position_x", "float", SURFELS_PER_WORD),
+        ("position_y", "float", SURFELS_PER_WORD),
+        ("position_z", "float", SURFELS_PER_WORD),
+        ("normal_x", "float", SURFELS_PER_WORD),
+        ("normal_y", "float", SURFELS_PER_WORD),
+        ("normal_z", "float", SURFELS_PER_WORD),
+        ("low", "float", 3),
+        ("padding_a", "float", 1),
+        ("high", "float", 3),
+        ("padding_b", "float", 1),
+    ),
 )
 LOCAL_LIGHT = Record(
     "LocalLight",
@@ -106,7 +120,7 @@ LOCAL_LIGHT = Record(
 )
 SHADOW_TRIANGLE = Record(
     "ShadowTriangle",
-    "A corner and the two edges that leave it [m], sector-local.",
+    "A corner and the two edges that leave it [m], local to the sector that it lies in.",
     (
         ("corner", "float", 3),
         ("padding_a", "float", 1),
@@ -130,7 +144,27 @@ SHADOW_FRAME = Record(
         ("padding_b", "float", 1),
     ),
 )
-RECORDS = (BOUNCE, DIRECTIONAL_LIGHT, VOLUME_BOX, SURFEL_PLACE, LOCAL_LIGHT, SHADOW_TRIANGLE, SHADOW_FRAME)
+SHADOW_NODE = Record(
+    "ShadowNode",
+    "A box about triangles [m]. skip: the next node for a ray that misses it. leaf: its first triangle * 8 + how many; 0 of a branch.",
+    (("low", "float", 3), ("skip", "uint", 1), ("high", "float", 3), ("leaf", "uint", 1)),
+)
+SHADOW_TILE = Record(
+    "ShadowTile",
+    "One sector's nodes and triangles, where they are. offset [m]: from the lit sector's coordinates to its own.",
+    (("offset", "float", 3), ("first_node", "uint", 1), ("end_node", "uint", 1), ("first_triangle", "uint", 1), ("padding", "uint", 2)),
+)
+RECORDS = (
+    BOUNCE,
+    DIRECTIONAL_LIGHT,
+    VOLUME_BOX,
+    LOCAL_LIGHT,
+    SHADOW_TRIANGLE,
+    SHADOW_FRAME,
+    SURFEL_WORD,
+    SHADOW_NODE,
+    SHADOW_TILE,
+)
 CONSTANTS: dict[str, int | float] = {
     "MAX_DIRECTIONAL_LIGHTS": MAX_DIRECTIONAL_LIGHTS,
     "PLANES_PER_LIGHT": PLANES_PER_LIGHT,
@@ -139,6 +173,7 @@ CONSTANTS: dict[str, int | float] = {
     "ROW_ONE": ROW_ONE,
     "WHOLE_SAMPLE": WHOLE_SAMPLE,
     "NO_SAMPLE": NO_SAMPLE,
+    "SURFELS_PER_WORD": SURFELS_PER_WORD,
     "LOCAL_POINT": LOCAL_POINT,
     "LOCAL_SPOT": LOCAL_SPOT,
     "LOCAL_AREA": LOCAL_AREA,

@@ -1,25 +1,43 @@
 """A sector's lamps on the device: what they give each surfel, shadowed, evaluated when a lamp changes and at no other time."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
+from itertools import count
 
 import numpy as np
 import pyopencl as cl
 
-from gi_core.arrays import AnyArray, Float64
+from gi_core.arrays import AnyArray, Float32
 from gi_core.device import Device
-from gi_core.layout import SHADOW_TRIANGLE, SURFEL_PLACE
+from gi_core.grid import SectorIndex
+from gi_core.layout import AREA_SHADOW_RAYS, LOCAL_AREA, LOCAL_LIGHT, SURFELS_PER_WORD
 from gi_core.light_geometry import ShadowGeometry
-from gi_core.light_plan import SurfelBounds, TouchingLamp, plan_launches, touching_lamps
-from gi_core.lights import check_lamp, light_records, reach_m, shadow_planes
+from gi_core.light_plan import MAX_LIGHTS_PER_LAUNCH, SurfelBounds, changed_spheres, surfel_words, touching_lamps
+from gi_core.lights import check_lamp, light_records
 from gi_core.sector import Sector
+from gi_core.shadow_bits import Shadow, ShadowBits
 from gi_core.world import Lamp
+
+# Work-items per work-group; kernels guard against the last group's excess.
+GROUP = 8
+# light_surfels.cl lights eight surfels in one work-item.
+_ITEMS_PER_WORD = SURFELS_PER_WORD // 8
+
+
+@dataclass(frozen=True, eq=False)
+class _Lit:
+    """A list of lamps as it was given, each one's shadow, None where it touches nothing, and layout.LOCAL_LIGHT of those that touch."""
+
+    given: tuple[Lamp, ...] = ()
+    shadows: tuple[Shadow | None, ...] = ()
+    records: AnyArray = field(default_factory=lambda: np.zeros(0, LOCAL_LIGHT.dtype))
 
 
 class SurfelLights:
     """Irradiance that lamps give a sector's surfels. Static ones are summed once and kept; dynamic ones are added to a copy of that sum.
 
-    The same lamps in the same order give the same bits, whatever was lit before: a lamp that goes off gives the first bytes back.
+    The same lamps in the same order give the same bits, whatever was lit before: a lamp that goes off gives the first bytes back. When
+    one of many changes, only its shadows are traced, and only surfels near it are summed anew.
     """
 
     def __init__(self, device: Device, sector: Sector, shadows: ShadowGeometry) -> None:
@@ -27,21 +45,20 @@ class SurfelLights:
         self.buffer: cl.Buffer | None = None
         """(S, 4) float32 [lx], the fourth 0: all lamps that touch. None when none does. Replaced only when it turns from or to None;
         its contents change with the lamps, in the device's queue."""
-        self._device = device
-        self._sector = sector
-        self._shadows = shadows
-        self._place: cl.Buffer | None = None
+        self._device, self._sector, self._geometry = device, sector, shadows
+        self._words = -(-sector.surfel_count // SURFELS_PER_WORD)
         self._bounds: SurfelBounds | None = None
+        self._places: cl.Buffer | None = None
+        self._bits = ShadowBits(device, self._words)
         self._static = self._dynamic = _Lit()
         self._static_sum: cl.Buffer | None = None
         self._kernels: dict[str, cl.Kernel] = {}
 
     @property
     def nbytes(self) -> int:
-        """Bytes on the device."""
-        held = [self.buffer, self._place, self._static_sum]
-        held += [traced.shadow_bits for lit in (self._static, self._dynamic) for traced in lit.traced]
-        return sum(int(buffer.size) for buffer in held if buffer is not None)
+        """Bytes on the device, without the geometry's, which all sectors share."""
+        held = (self.buffer, self._places, self._static_sum)
+        return self._bits.nbytes + sum(int(buffer.size) for buffer in held if buffer is not None)
 
     @property
     def given(self) -> tuple[tuple[Lamp, ...], tuple[Lamp, ...]]:
@@ -55,143 +72,141 @@ class SurfelLights:
         Raises InputError for a touching lamp that is out of its ranges, CorruptFileError for geometry that cannot be read; then the
         light stays as it was.
         """
-        if tuple(lamps) != self._static.given:
-            lit = self._changed(self._static, lamps)
-            total = self._allocate() if lit.traced else None
-            if total is not None:
-                self._add(lit, total)
-            self._static, self._static_sum = lit, total
-            self._sum()
+        before, after = self._static, self._changed(self._static, tuple(lamps), self._dynamic)
+        self._static = after
+        if after.records.tobytes() == before.records.tobytes():
+            return
+        changed = changed_spheres(before.given, after.given, self._sector.index.origin)
+        if not len(after.records):
+            self._static_sum = None
+        else:
+            if self._static_sum is None:
+                self._static_sum, changed = self._allocate(), None
+            self._sum(after, None, self._static_sum, changed)
+        self._sum_all(changed)
 
     def set_dynamic(self, lamps: Sequence[Lamp]) -> None:
         """Lamps that move or flicker, as ``set_static``."""
-        if tuple(lamps) != self._dynamic.given:
-            self._dynamic = self._changed(self._dynamic, lamps)
-            self._sum()
+        before, after = self._dynamic, self._changed(self._dynamic, tuple(lamps), self._static)
+        self._dynamic = after
+        if after.records.tobytes() != before.records.tobytes():
+            self._sum_all(changed_spheres(before.given, after.given, self._sector.index.origin))
 
-    def _sum(self) -> None:
-        if self._static_sum is None and not self._dynamic.traced:
-            self.buffer = self._place = None
+    def _sum_all(self, changed: Float32 | None) -> None:
+        if not len(self._static.records) and not len(self._dynamic.records):
+            self.buffer = self._places = None
+            self._bits.clear()
             return
         if self.buffer is None:
-            self.buffer = self._allocate()
-        if self._static_sum is not None:
-            cl.enqueue_copy(self._device.queue, self.buffer, self._static_sum)
-        else:
-            cl.enqueue_fill_buffer(self._device.queue, self.buffer, np.uint8(0), 0, self.buffer.size)
-        self._add(self._dynamic, self.buffer)
-
-    def _changed(self, before: "_Lit", lamps: Sequence[Lamp]) -> "_Lit":
-        """The lamps with their shadows: those of before when the lamps stand as they stood then."""
-        given = tuple(lamps)
-        if [_as_it_stands(lamp) for lamp in given] == [_as_it_stands(lamp) for lamp in before.given]:
-            return _Lit(given, tuple(traced.relit(given) for traced in before.traced))
-        return _Lit(given, self._trace(given))
+            self.buffer, changed = self._allocate(), None
+        self._sum(self._dynamic, self._static_sum, self.buffer, changed)
 
     def _allocate(self) -> cl.Buffer:
         return self._device.allocate(16 * self._sector.surfel_count)
 
-    def _trace(self, lamps: Sequence[Lamp]) -> "tuple[_Traced, ...]":
-        """Shadows of the lamps that touch, in their order."""
+    def _changed(self, before: _Lit, given: tuple[Lamp, ...], others: _Lit) -> _Lit:
+        """Lamps with their shadows, traced for those that stand as none did before. Raises before anything has changed."""
+        if given == before.given:
+            return before
+        place = {id(lamp): i for i, lamp in enumerate(before.given)}
+        was = [place.get(id(lamp), -1) for lamp in given]
+        shadows = [before.shadows[at] if at >= 0 else self._bits.find(lamp) for at, lamp in zip(was, given, strict=True)]
+        arrived = [i for i, at in enumerate(was) if at < 0]
+        for i in arrived:
+            if shadows[i] is not None:
+                check_lamp(given[i])
+        unknown = [i for i in arrived if shadows[i] is None]
+        touching = self._touching([given[i] for i in unknown])
+
+        self._bits.keep({*others.shadows, *shadows})
+        untraced: dict[int, list[SectorIndex]] = {}
+        for number, about in touching.items():
+            i = unknown[number]
+            shadows[i] = self._bits.find(given[i])  # there is one when the same list has two lamps that stand alike
+            if shadows[i] is None:
+                shadows[i] = self._bits.add(given[i])
+                untraced[i] = about
+        planes = {i: shadow.plane for i in arrived if (shadow := shadows[i]) is not None}
+        records = light_records([given[i] for i in planes], self._sector.index.origin)
+        records["first_plane"] = list(planes.values())
+        self._trace(records[[i in untraced for i in planes]], list(untraced.values()))
+        return _Lit(given, tuple(shadows), _in_order(before, was, shadows, records))
+
+    def _touching(self, lamps: Sequence[Lamp]) -> dict[int, list[SectorIndex]]:
+        """Which of the lamps touch, and for each the sectors whose triangles may shadow it. Those have been read when this returns."""
         if not lamps:
-            return ()
+            return {}
         self._bounds = self._bounds or SurfelBounds(self._sector)
-        touching = touching_lamps(lamps, self._bounds)
-        near = [shadow_triangles(self._shadows, lamp, self._sector.index.origin) for lamp in touching]
-        launches = plan_launches([len(triangles) for triangles in near])
-        return tuple(self._trace_launch([touching[i] for i in launch], [near[i] for i in launch]) for launch in launches)
+        touching = {found.index: self._geometry.sectors_in(found.low, found.high) for found in touching_lamps(lamps, self._bounds)}
+        for index in {index for about in touching.values() for index in about}:
+            self._geometry.tree(index)
+        return touching
 
-    def _trace_launch(self, touching: list[TouchingLamp], triangles: list[AnyArray]) -> "_Traced":
-        device, sector = self._device, self._sector
-        lamps = tuple(found.lamp for found in touching)
-        words = (sector.surfel_count + 31) // 32
-        plane_counts = [shadow_planes(lamp) for lamp in lamps]
-        planes = sum(plane_counts)
-        # Every word is written: zeros would be a pass of their own.
-        shadow_bits = cl.Buffer(device.context, cl.mem_flags.READ_WRITE, 4 * words * planes)
-        arguments = [
-            np.uint32(sector.surfel_count),
-            np.uint32(words),
-            self._places(),
-            device.upload(light_records(lamps, sector.index.origin)),
-            device.upload(np.repeat(np.arange(len(lamps), dtype=np.uint32), plane_counts)),
-            device.upload(np.cumsum([0, *(len(t) for t in triangles)]).astype(np.uint32)),
-            device.upload(np.concatenate(triangles)),
-            shadow_bits,
-        ]
-        self._kernel("trace_shadows")(device.queue, (words, planes), None, *arguments)
-        return _Traced(lamps, tuple(found.index for found in touching), shadow_bits)
+    def _trace(self, records: AnyArray, about: Sequence[list[SectorIndex]]) -> None:
+        """Enqueue the tracing of lamps' shadows (n,) layout.LOCAL_LIGHT, each against the triangles of the sectors about it."""
+        device, tiles = self._device, self._geometry.on_device(self._device)
+        for first in range(0, len(records), MAX_LIGHTS_PER_LAUNCH):
+            some, near = records[first : first + MAX_LIGHTS_PER_LAUNCH], about[first : first + MAX_LIGHTS_PER_LAUNCH]
+            rays = np.where(some["kind"] == LOCAL_AREA, AREA_SHADOW_RAYS, 1)
+            planes = [light * AREA_SHADOW_RAYS + ray for light, count in enumerate(rays.tolist()) for ray in range(count)]
+            lights, plane_buffer, bits = device.upload(some), device.upload(np.array(planes, np.uint32)), self._bits.ready()
+            for again, (group, nodes, triangles) in enumerate(tiles.groups({index for indices in near for index in indices})):
+                chosen = [[index for index in indices if index in group] for indices in near]
+                arguments = [
+                    np.uint32(self._words),
+                    self._surfel_places(),
+                    lights,
+                    plane_buffer,
+                    device.upload(np.cumsum([0, *map(len, chosen)]).astype(np.uint32)),
+                    device.upload(tiles.records([index for indices in chosen for index in indices], self._sector.index)),
+                    nodes,
+                    triangles,
+                    np.uint32(again),
+                    bits,
+                ]
+                self._run("trace_shadows", (self._words, len(planes)), arguments)
 
-    def _add(self, lit: "_Lit", target: cl.Buffer) -> None:
-        """Enqueue the addition of lamps to a sum, in their order."""
-        device, sector = self._device, self._sector
-        for launch in lit.traced:
+    def _sum(self, lit: _Lit, base: cl.Buffer | None, target: cl.Buffer, changed: Float32 | None) -> None:
+        """Enqueue target = base + lamps in their order, where ``changed`` spheres reach, or everywhere."""
+        device = self._device
+        spheres = np.zeros((0, 4), np.float32) if changed is None else changed
+        sphere_buffer, bits = device.upload(spheres), self._bits.ready()
+        for first in range(0, max(len(lit.records), 1), MAX_LIGHTS_PER_LAUNCH):
+            some = lit.records[first : first + MAX_LIGHTS_PER_LAUNCH]
+            before = target if first else base
             arguments = [
-                np.uint32(sector.surfel_count),
-                np.uint32((sector.surfel_count + 31) // 32),
-                self._places(),
-                device.upload(light_records(launch.lamps, sector.index.origin)),
-                np.uint32(len(launch.lamps)),
-                launch.shadow_bits,
+                np.uint32(self._sector.surfel_count),
+                np.uint32(self._words),
+                self._surfel_places(),
+                device.upload(some),
+                np.uint32(len(some)),
+                bits,
+                sphere_buffer,
+                np.uint32(len(spheres)),
+                target if before is None else before,
+                np.uint32(before is not None),
                 target,
             ]
-            self._kernel("light_surfels")(device.queue, (sector.surfel_count,), None, *arguments)
+            self._run("light_surfels", (_ITEMS_PER_WORD * self._words, 1), arguments)
 
-    def _kernel(self, name: str) -> cl.Kernel:
+    def _run(self, name: str, size: tuple[int, int], arguments: list[object]) -> None:
         # Making a kernel takes longer than running it.
         if name not in self._kernels:
             self._kernels[name] = self._device.kernel(name)
-        return self._kernels[name]
+        rounded = -(-size[0] // GROUP) * GROUP
+        self._kernels[name](self._device.queue, (rounded, size[1]), (GROUP, 1), *arguments)
 
-    def _places(self) -> cl.Buffer:
-        if self._place is None:
-            self._place = self._device.upload(surfel_places(self._sector))
-        return self._place
-
-
-@dataclass(frozen=True, eq=False)
-class _Traced:
-    """The lamps of one launch, where they stand in the list that they were given in, and their shadow bits."""
-
-    lamps: tuple[Lamp, ...]
-    indices: tuple[int, ...]
-    shadow_bits: cl.Buffer
-
-    def relit(self, lamps: Sequence[Lamp]) -> "_Traced":
-        """The same shadows with other lumens and colours, from a list of as many lamps. Raises InputError."""
-        chosen = tuple(lamps[i] for i in self.indices)
-        for lamp in chosen:
-            check_lamp(lamp)
-        return replace(self, lamps=chosen)
+    def _surfel_places(self) -> cl.Buffer:
+        if self._places is None:
+            self._places = self._device.upload(surfel_words(self._sector))
+        return self._places
 
 
-@dataclass(frozen=True, eq=False)
-class _Lit:
-    """A list of lamps as it was given, and what was traced for those of them that touch."""
-
-    given: tuple[Lamp, ...] = ()
-    traced: tuple[_Traced, ...] = ()
-
-
-def _as_it_stands(lamp: Lamp) -> Lamp:
-    """A lamp without what its shadows do not depend on."""
-    return replace(lamp, name="", lumens=0.0, color=(0.0, 0.0, 0.0), schedule="always")
-
-
-def surfel_places(sector: Sector) -> AnyArray:
-    """(S,) records of layout.SURFEL_PLACE."""
-    places = np.zeros(sector.surfel_count, SURFEL_PLACE.dtype)
-    places["position"], places["normal"] = sector.surfel_position, sector.surfel_normal
-    return places
-
-
-def shadow_triangles(shadows: ShadowGeometry, touching: TouchingLamp, origin: Float64) -> AnyArray:
-    """(n,) records of layout.SHADOW_TRIANGLE, local to ``origin`` (3,) [m]: all that can come between a lamp and what it lights."""
-    corners = shadows.triangles_in(touching.low, touching.high)
-    position = np.array(touching.lamp.position)
-    beyond = position - np.clip(position, corners.min(axis=1), corners.max(axis=1))
-    corners = corners[np.einsum("ij,ij->i", beyond, beyond) < reach_m(touching.lamp) ** 2] - origin
-    records = np.zeros(len(corners), SHADOW_TRIANGLE.dtype)
-    records["corner"] = corners[:, 0]
-    records["edge_a"], records["edge_b"] = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    return records
+def _in_order(before: _Lit, was: Sequence[int], shadows: Sequence[Shadow | None], arrived: AnyArray) -> AnyArray:
+    """Records of the lamps that touch: from before where ``was`` tells a lamp's place there, else the next of those that arrived."""
+    row = count()
+    old = [next(row) if shadow is not None else -1 for shadow in before.shadows]
+    rows = [next(row) if at < 0 else old[at] for at, shadow in zip(was, shadows, strict=True) if shadow is not None]
+    # As bytes: NumPy compares the types of records field by field, which takes longer than all the rest.
+    both = np.concatenate([records.view(np.uint8).reshape(-1, LOCAL_LIGHT.dtype.itemsize) for records in (before.records, arrived)])
+    return both[rows].view(LOCAL_LIGHT.dtype)[:, 0] if rows else arrived

@@ -171,12 +171,14 @@ def _cone_cosines(lamp: Lamp) -> tuple[float, float]:
 
 def _intensity(lamp: Lamp) -> Float64:
     """(3,) linear sRGB whose luminance is the lamp's intensity [cd], or an area's radiance [cd m^-2]."""
-    luminance = float(LUMINANCE_FROM_RGB @ lamp.color)
-    if luminance <= 0:
+    brightest = max(lamp.color)
+    if brightest <= 0:
         return np.zeros(3)
+    # Only ratios count. Without this the luminance of the least of colours is too small to divide by.
+    color = np.array(lamp.color, np.float64) / brightest
     spread = 4 * math.pi
     if lamp.kind == "spot":
         spread = 2 * math.pi * (1 - sum(_cone_cosines(lamp)) / 2)
     elif lamp.kind == "area":
         spread = math.pi * lamp.size[0] * lamp.size[1]
-    return np.array(lamp.color, np.float64) * (lamp.lumens / (spread * luminance))
+    return color * (lamp.lumens / (spread * float(LUMINANCE_FROM_RGB @ color)))

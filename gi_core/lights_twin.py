@@ -2,12 +2,44 @@
 
 import numpy as np
 
-from gi_core.arrays import AnyArray, Bool, Float32
-from gi_core.layout import AREA_SHADOW_RAYS, LAMP_RADIUS_M, LOCAL_AREA, LOCAL_POINT, LOCAL_SPOT, SHADOW_END_M, SHADOW_START_M
+from gi_core.arrays import AnyArray, Bool, Float32, Float64
+from gi_core.layout import (
+    AREA_SHADOW_RAYS,
+    LAMP_RADIUS_M,
+    LOCAL_AREA,
+    LOCAL_POINT,
+    LOCAL_SPOT,
+    SHADOW_END_M,
+    SHADOW_START_M,
+    SHADOW_TRIANGLE,
+)
+from gi_core.light_geometry import ShadowGeometry
+from gi_core.light_plan import TouchingLamp
+from gi_core.sector import Sector
 
 # As in lights.h and trace_shadows.cl.
 AREA_IS_POINT_FROM = np.float32(32)
 EDGE_SLACK = np.float32(1e-5)
+
+
+# What lamps need of a surfel: its place [m], sector-local, and its unit normal.
+PLACE = np.dtype([("position", np.float32, 3), ("normal", np.float32, 3)])
+
+
+def surfel_places(sector: Sector) -> AnyArray:
+    """(S,) records of PLACE."""
+    places = np.zeros(sector.surfel_count, PLACE)
+    places["position"], places["normal"] = sector.surfel_position, sector.surfel_normal
+    return places
+
+
+def shadow_triangles(shadows: ShadowGeometry, touching: TouchingLamp, origin: Float64) -> AnyArray:
+    """(n,) records of layout.SHADOW_TRIANGLE, local to ``origin`` (3,) [m]: all that can come between a lamp and what it lights."""
+    corners = shadows.triangles_in(touching.low, touching.high) - origin
+    records = np.zeros(len(corners), SHADOW_TRIANGLE.dtype)
+    records["corner"] = corners[:, 0]
+    records["edge_a"], records["edge_b"] = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    return records
 
 
 def ray_targets(light: AnyArray) -> Float32:

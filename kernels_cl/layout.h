@@ -9,6 +9,7 @@
 #define ROW_ONE 1065353216
 #define WHOLE_SAMPLE 254
 #define NO_SAMPLE 255
+#define SURFELS_PER_WORD 32
 #define LOCAL_POINT 0
 #define LOCAL_SPOT 1
 #define LOCAL_AREA 2
@@ -42,14 +43,6 @@ typedef struct {
     int sector_size[4];
 } VolumeBox;
 
-// Where a surfel is [m], sector-local, and its unit normal: what local lights need of it.
-typedef struct {
-    float position[3];
-    float padding_a;
-    float normal[3];
-    float padding_b;
-} SurfelPlace;
-
 // A lamp, sector-local [m]. intensity [cd], or an area's radiance [cd m^-2]; axis and halves as gi_core/lights.py defines them.
 typedef struct {
     float position[3];
@@ -64,7 +57,7 @@ typedef struct {
     uint first_plane;
 } LocalLight;
 
-// A corner and the two edges that leave it [m], sector-local.
+// A corner and the two edges that leave it [m], local to the sector that it lies in.
 typedef struct {
     float corner[3];
     float padding_a;
@@ -85,5 +78,36 @@ typedef struct {
     float origin[3];
     float padding_b;
 } ShadowFrame;
+
+// Where 32 surfels are [m], sector-local, and their unit normals, by coordinate, and the box about them. A word of bits has as many.
+typedef struct {
+    float position_x[32];
+    float position_y[32];
+    float position_z[32];
+    float normal_x[32];
+    float normal_y[32];
+    float normal_z[32];
+    float low[3];
+    float padding_a;
+    float high[3];
+    float padding_b;
+} SurfelWord;
+
+// A box about triangles [m]. skip: the next node for a ray that misses it. leaf: its first triangle * 8 + how many; 0 of a branch.
+typedef struct {
+    float low[3];
+    uint skip;
+    float high[3];
+    uint leaf;
+} ShadowNode;
+
+// One sector's nodes and triangles, where they are. offset [m]: from the lit sector's coordinates to its own.
+typedef struct {
+    float offset[3];
+    uint first_node;
+    uint end_node;
+    uint first_triangle;
+    uint padding[2];
+} ShadowTile;
 
 #endif

@@ -172,6 +172,9 @@ def compare(
     source: Annotated[
         str | None, typer.Option(help="What was baked, wanted when --sectors of the bake left out what surrounds these sectors.")
     ] = None,
+    lamps: Annotated[
+        Path | None, typer.Option(metavar="FILE.toml", help="Take its [[lamp]]s instead of the dataset's own; nothing is baked.")
+    ] = None,
     json_path: Annotated[Path | None, typer.Option("--json", metavar="OUT", help="Write the report here.")] = None,
     plot_path: Annotated[Path | None, typer.Option("--plot", metavar="OUT.png", help="Draw medians and 95th percentiles here.")] = None,
     device: DeviceOption = None,
@@ -182,7 +185,9 @@ def compare(
     chosen = cli_compare.sectors_of(dataset, parse_sectors(sectors) if ":" in sectors else sectors, seed)
     try:
         with writing(json_path or plot_path):
-            cli_compare.run(dataset, cli_compare.split_states(states), chosen, points, samples, seed, source, json_path, plot_path, device)
+            cli_compare.run(
+                dataset, cli_compare.split_states(states), chosen, points, samples, seed, source, lamps, json_path, plot_path, device
+            )
     except KeyboardInterrupt:
         fail("interrupted; nothing was written", INTERRUPTED)
 

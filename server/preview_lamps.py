@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from gi_core.arrays import AnyArray, Float32, Float64, Int64
-from gi_core.layout import LAMP_RADIUS_M, LOCAL_AREA, LOCAL_SPOT, SHADOW_END_M, SURFEL_PLACE
+from gi_core.layout import LAMP_RADIUS_M, LOCAL_AREA, LOCAL_SPOT, SHADOW_END_M
 from gi_core.lights import light_records
-from gi_core.lights_twin import ray_targets, unshadowed, visible_share
+from gi_core.lights_twin import PLACE, ray_targets, unshadowed, visible_share
 from gi_core.world import Lamp
 from server.camera import Camera
 from server.raycast import RayCaster
@@ -66,7 +66,7 @@ def lamp_irradiance(rays: RayCaster, lamps: Sequence[Lamp], position: Float64, n
         return irradiance
     cells = PixelCells.of(position)
     # In the cells' order a lamp's points lie side by side: gathering them costs half as much.
-    places = np.zeros(len(position), SURFEL_PLACE.dtype)
+    places = np.zeros(len(position), PLACE)
     places["position"], places["normal"] = (position - rays.anchor)[cells.order], normal[cells.order]
     total = np.zeros_like(irradiance)
     for light in light_records(lamps, rays.anchor):

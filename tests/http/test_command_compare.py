@@ -46,6 +46,19 @@ def test_the_same_seed_gives_the_same_report(sectorlight: RunCommand, city: Path
     assert reports[0] == reports[1] != reports[2]
 
 
+def test_lamps_of_a_file_take_the_place_of_the_datasets_own(sectorlight: RunCommand, city: Path, tmp_path: Path) -> None:
+    reports = {}
+    for name, lumens in (("bright", 1e6), ("dim", 1.0)):
+        lamps, out = tmp_path / f"{name}.toml", tmp_path / f"{name}.json"
+        lamps.write_text(f'[[lamp]]\nname = "one"\nposition = [30, 9, 5]\nlumens = {lumens}\nschedule = "night"\n')
+        done = sectorlight("compare", str(city), *SMALL, "--states", "noon,night", "--lamps", str(lamps), "--json", str(out))
+        assert done.returncode == 0, done.stderr
+        reports[name] = json.loads(out.read_text())
+        assert reports[name]["lamps_on"] == {"noon": 0, "night": 1}
+    assert reports["bright"]["states"]["noon"] == reports["dim"]["states"]["noon"]
+    assert reports["bright"]["states"]["night"] != reports["dim"]["states"]["night"]
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -58,6 +71,7 @@ def test_the_same_seed_gives_the_same_report(sectorlight: RunCommand, city: Path
         (("--sectors", "900:901,0:1"), ("900:901,0:1", "info")),
         (("--sectors", "1:0,0:1"), ("X0 < X1",)),
         (("--source", "nowhere.glb"), ("nowhere.glb",)),
+        (("--lamps", "nowhere.toml"), ("nowhere.toml",)),
         (("--device", "abacus"), ("abacus", "there are")),
         (("--json", "nowhere/out.json"), ("nowhere/out.json", "folder that exists")),
         (("--plot", "nowhere/out.png"), ("nowhere/out.png", "folder that exists")),

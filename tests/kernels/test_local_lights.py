@@ -16,8 +16,9 @@ from gi_core.grid import SectorIndex
 from gi_core.layout import SHADOW_END_M, SHADOW_START_M
 from gi_core.light_geometry import ShadowGeometry
 from gi_core.light_plan import SurfelBounds, touching_lamps
-from gi_core.light_surfels import SurfelLights, shadow_triangles, surfel_places
+from gi_core.light_surfels import SurfelLights
 from gi_core.lights import light_records
+from gi_core.lights_twin import shadow_triangles, surfel_places
 from gi_core.spectrum import LUMINANCE_FROM_RGB
 from gi_core.world import Lamp
 
@@ -345,11 +346,11 @@ def test_a_lamp_that_flickers_keeps_its_shadows_and_one_that_moves_does_not(devi
     lamps = random_lamps(rng, 40)
     lit = SurfelLights(device, sector, shadows)
     lit.set_dynamic(lamps)
-    held, bits = lit.nbytes, [traced.shadow_bits for traced in lit._dynamic.traced]
-    assert len(bits) == 2
+    planes = [shadow.plane for shadow in lit._dynamic.shadows if shadow]
+    assert len(planes) > 30
     dimmed = [replace(lamp, lumens=lamp.lumens * 0.3, color=(0.2, 0.9, 0.4)) for lamp in lamps]
     lit.set_dynamic(dimmed)
-    assert [traced.shadow_bits for traced in lit._dynamic.traced] == bits
+    assert [shadow.plane for shadow in lit._dynamic.shadows if shadow] == planes
     assert read(device, lit, sector).tobytes() == light_of(device, sector, dimmed, shadows).tobytes()
     with pytest.raises(InputError, match="lumens"):
         lit.set_dynamic([replace(lamp, lumens=-1.0) for lamp in lamps])
@@ -359,9 +360,112 @@ def test_a_lamp_that_flickers_keeps_its_shadows_and_one_that_moves_does_not(devi
     moved = [replace(lamp, position=(5.0, float(i), 9.0)) for i, lamp in enumerate(lamps)]
     lit.set_dynamic(moved)
     assert read(device, lit, sector).tobytes() == light_of(device, sector, moved, shadows).tobytes()
-    lit.set_dynamic(lamps)
+    held = lit.nbytes
+    for _ in range(20):  # planes are used again
+        lit.set_dynamic(lamps)
+        lit.set_dynamic(moved)
     assert lit.nbytes == held
     lit.set_dynamic([])
     for brightened in (lamps, dimmed):
         lit.set_static(brightened)
         assert read(device, lit, sector).tobytes() == light_of(device, sector, brightened, shadows).tobytes()
+
+
+def split_by_sector(triangles: np.ndarray, kept_bytes: int = 1 << 28) -> ShadowGeometry:
+    """Triangles (n, 3, 3) in files of the sectors that their first corners lie in; each must lie in that sector's column."""
+    index = [SectorIndex(*np.floor(t[0, [0, 2]] / 64).astype(int).tolist()) for t in triangles]
+    files = {}
+    for i in set(index):
+        own = triangles[[j == i for j in index]]
+        flat = np.zeros((len(own), 3), np.float32)
+        files[i] = Geometry(own.reshape(-1, 3), np.arange(3 * len(own), dtype=np.int32).reshape(-1, 3), flat, flat)
+    return ShadowGeometry(files.__getitem__, files, kept_bytes)
+
+
+def triangles_of_four_sectors(rng: np.random.Generator, count: int) -> np.ndarray:
+    corner = rng.uniform(0, 128, (count, 1, 3)) * (1, 0.5, 1) - (64, 0, 64)
+    cell = np.floor(corner / 64) * 64
+    triangles = corner + rng.normal(size=(count, 3, 3)) * 8
+    triangles[..., [0, 2]] = np.clip(triangles, cell, cell + 63.999)[..., [0, 2]]
+    return triangles
+
+
+@pytest.mark.parametrize(("kept_bytes", "groups"), [(1 << 28, 1), (12_000, 2), (1, 4)])
+def test_shadows_fall_across_sectors_and_do_not_depend_on_what_fits_on_the_device(device, make_sector, kept_bytes, groups):
+    rng = np.random.default_rng(31)
+    sector = in_one_column(make_sector(31, surfels=400), 31)
+    triangles = triangles_of_four_sectors(rng, 200)
+    given = random_lamps(rng, 20)
+    shadows = split_by_sector(triangles, kept_bytes)
+    found = light_of(device, sector, given, shadows)
+    everywhere = shadows.sectors_in(np.full(3, -1e6), np.full(3, 1e6))
+    assert len(everywhere) == 4
+    assert len(list(shadows.on_device(device).groups(everywhere))) == groups
+    assert found.tobytes() == light_of(device, sector, given, split_by_sector(triangles)).tobytes()
+    touching = touching_lamps(given, SurfelBounds(sector))
+    near = [shadow_triangles(shadows, t, sector.index.origin) for t in touching]
+    expected = lights_twin.light_surfels(light_records([t.lamp for t in touching], sector.index.origin), surfel_places(sector), near)
+    assert np.isclose(found, expected, rtol=3e-5, atol=1e-5 * expected.max()).all(axis=1).sum() >= 399  # one may graze an edge
+    here = split_by_sector(triangles[(triangles[:, 0, [0, 2]] >= 0).all(axis=1)])
+    assert (light_of(device, sector, given, here) > 1.01 * found).any(), "no triangle of a neighbour stood in any lamp's way"
+
+
+def test_whatever_was_lit_before_the_same_lamps_give_the_same_bytes(device, make_sector):
+    rng = np.random.default_rng(32)
+    sector = in_one_column(make_sector(32, surfels=500), 32)
+    shadows = split_by_sector(triangles_of_four_sectors(rng, 60))
+    lists = [random_lamps(rng, 12), random_lamps(rng, 12)]
+    lit = SurfelLights(device, sector, shadows)
+    for _ in range(60):
+        which = int(rng.integers(2))
+        lamps, what, i = list(lists[which]), int(rng.integers(6)), int(rng.integers(100))
+        other = random_lamps(rng, 3)[int(rng.integers(3))]
+        if what == 0 or not lamps:
+            lamps.insert(i % (len(lamps) + 1), other)
+        elif what == 1:
+            del lamps[i % len(lamps)]
+        elif what == 2:
+            lamps[i % len(lamps)] = replace(lamps[i % len(lamps)], lumens=float(rng.uniform(1, 1e4)))
+        elif what == 3:
+            lamps.append(lamps[i % len(lamps)])  # twice
+        elif what == 4:
+            lamps.append(replace(lists[1 - which][0]) if lists[1 - which] else other)  # as one of the other list
+        else:
+            lamps[i % len(lamps)] = replace(other, range_m=12.0)
+        lists[which] = lamps
+        (lit.set_static if which == 0 else lit.set_dynamic)(lamps)
+        if rng.random() < 0.4:
+            assert read(device, lit, sector).tobytes() == light_of(device, sector, lists[0], shadows, lists[1]).tobytes()
+    assert read(device, lit, sector).any()
+    lit.set_static([])
+    lit.set_dynamic([])
+    assert lit.nbytes == 0
+
+
+def test_of_many_lamps_only_the_one_that_moved_is_traced(device, make_sector, monkeypatch):
+    rng = np.random.default_rng(33)
+    sector = in_one_column(make_sector(33, surfels=300), 33)
+    lamps = [replace(lamp, kind="point") for lamp in random_lamps(rng, 300)]
+    lit = SurfelLights(device, sector, geometry_of(rng.uniform(0, 64, (30, 3, 3))))
+    launched = []
+    run = SurfelLights._run
+
+    def spy(self, name, size, arguments):
+        launched.append((name, size[1]))
+        run(self, name, size, arguments)
+
+    monkeypatch.setattr(SurfelLights, "_run", spy)
+    lit.set_dynamic(lamps)
+    assert sum(planes for name, planes in launched if name == "trace_shadows") == len(touching_lamps(lamps, SurfelBounds(sector))) > 250
+    for other in (replace(lamps[70], position=(20.0, 9.0, 30.0)), replace(lamps[70], position=(30.0, 9.0, 30.0))):
+        launched.clear()
+        lamps[70] = other
+        lit.set_dynamic(lamps)
+        assert [planes for name, planes in launched if name == "trace_shadows"] == [1]
+    launched.clear()
+    lit.set_dynamic([*lamps[:9], replace(lamps[9], lumens=7.0), *lamps[10:], replace(lamps[0], position=(9e5, 0.0, 0.0))])
+    assert all(name == "light_surfels" for name, _ in launched)
+    assert launched
+    launched.clear()
+    lit.set_dynamic([*lamps[:9], replace(lamps[9], lumens=7.0), *lamps[10:], replace(lamps[0], position=(8e5, 0.0, 0.0))])
+    assert launched == []  # what moves far away costs nothing here
