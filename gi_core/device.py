@@ -1,6 +1,7 @@
 """OpenCL device: which one, its queue, and kernels built for what a scene needs."""
 
 import os
+import threading
 import warnings
 from functools import lru_cache
 from typing import Any
@@ -44,6 +45,28 @@ def choose_device(name: str | None) -> cl.Device:
     return next((d for d in devices if "portable computing" in d.platform.name.lower()), devices[0])
 
 
+class SharedKernel:
+    """A kernel that everyone launches with arguments of their own. An instance for each would take half a millisecond to make.
+
+    pyopencl is told what the arguments are: left to find out, it raises and catches a C++ exception for each number, 12 us apiece.
+    """
+
+    def __init__(self, queue: cl.CommandQueue, kernel: cl.Kernel) -> None:
+        self._queue = queue
+        self._kernel = kernel
+        self._types: tuple[Any, ...] = ()
+        self._lock = threading.Lock()
+
+    def launch(self, size: tuple[int, ...], group: tuple[int, ...] | None, *arguments: Any) -> None:
+        """Enqueue the kernel: global and local size, then buffers, NumPy scalars and (1,) records. None: the driver picks a local size."""
+        types = tuple(None if isinstance(argument, cl.Buffer) else argument.dtype for argument in arguments)
+        with self._lock:
+            if types != self._types:
+                self._kernel.set_scalar_arg_dtypes(types)
+                self._types = types
+            self._kernel(self._queue, size, group, *arguments)
+
+
 class Device:
     """A device with an in-order queue, and the programs built for it so far."""
 
@@ -54,6 +77,7 @@ class Device:
         self.context = cl.Context([self.device])
         self.queue = cl.CommandQueue(self.context)
         self._programs: dict[tuple[str, tuple[tuple[str, int], ...]], cl.Program] = {}
+        self._shared_kernels: dict[tuple[object, ...], SharedKernel] = {}
         try:
             self._check_layout()
         except KernelBuildError as error:
@@ -70,6 +94,17 @@ class Device:
         if key not in self._programs:
             self._programs[key] = self.build(source(f"{name}.cl"), f"{name}.cl", **defines)
         return cl.Kernel(self._programs[key], name)
+
+    def shared_kernel(self, name: str, **defines: int) -> SharedKernel:
+        """The kernel ``name`` of ``name.cl`` that all of the process launch, built at the first call; defines in the same order each time.
+
+        Raises KernelBuildError with the compiler's log.
+        """
+        key = (name, *defines.items())
+        found = self._shared_kernels.get(key)
+        if found is None:
+            found = self._shared_kernels[key] = SharedKernel(self.queue, self.kernel(name, **defines))
+        return found
 
     def build(self, text: str, name: str, **defines: int) -> cl.Program:
         """Compile OpenCL C with the kernels' include path. Raises KernelBuildError."""

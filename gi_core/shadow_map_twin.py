@@ -3,12 +3,14 @@
 import numpy as np
 
 from gi_core.arrays import AnyArray, Bool, Float32, Float64, UInt8
-from gi_core.layout import SHADOW_BIAS_CELLS, SHADOW_BIAS_M, WHOLE_SAMPLE
+from gi_core.layout import SHADOW_BIAS_CELLS, SHADOW_BIAS_M, SHADOW_TAPS, WHOLE_SAMPLE
 from gi_core.shadow_plan import MAP_TEXELS, TEXELS_PER_METRE, ShadowPlan
 
 NOTHING_DRAWN = np.float32(-1e30)
 LEAST_COSINE = 0.01
-TAPS = 4
+# Hammersley's points on the square -1..1: (SHADOW_TAPS, 2), across and down.
+TAPS = np.array([[i, int(f"{i:0{SHADOW_TAPS.bit_length() - 1}b}"[::-1], 2)] for i in range(SHADOW_TAPS)]) * 2 / SHADOW_TAPS
+TAPS += 1 / SHADOW_TAPS - 1
 
 
 def map_from_world(plan: ShadowPlan, points: Float64) -> Float64:
@@ -48,10 +50,9 @@ def sample(plan: ShadowPlan, depth: Float32, position: Float64, normal: Float32,
     across, down = normal @ plan.across, normal @ plan.down
     spread = size / 2 * TEXELS_PER_METRE
     steep = np.maximum(1 - cosine**2, 1e-6)
-    taps = ((np.arange(TAPS) + 0.5) * 2 / TAPS - 1)[:, None]
     lit: AnyArray = np.zeros(len(position))
-    for tap in np.indices((TAPS, TAPS)).reshape(2, -1).T:
-        a, b = taps[tap[1], 0] * spread, taps[tap[0], 0] * spread
+    for tap in TAPS:
+        a, b = tap[0] * spread, tap[1] * spread
         slant = np.where(1 - cosine**2 > 1e-6, (a * across + b * down) * (1 - cosine) / steep, 0)
         texel = np.floor(middle[:, :2] + np.stack([a - slant * across, b - slant * down], axis=1)).astype(int)
         step = texel + 0.5 - middle[:, :2]
@@ -61,5 +62,5 @@ def sample(plan: ShadowPlan, depth: Float32, position: Float64, normal: Float32,
     inside = ((middle[:, :2] - spread[:, None] >= 0) & (middle[:, :2] + spread[:, None] < MAP_TEXELS)).all(axis=1)
     valid = inside & (position[:, 1] + plan.reach_height_m >= top_m)
     away = cosine <= LEAST_COSINE
-    share = np.where(away, 0, (lit * WHOLE_SAMPLE + TAPS * TAPS // 2) // (TAPS * TAPS))
+    share = np.where(away, 0, (lit * WHOLE_SAMPLE + SHADOW_TAPS // 2) // SHADOW_TAPS)
     return share.astype(np.uint8), np.asarray(valid | away)
