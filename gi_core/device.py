@@ -54,16 +54,16 @@ class SharedKernel:
     def __init__(self, queue: cl.CommandQueue, kernel: cl.Kernel) -> None:
         self._queue = queue
         self._kernel = kernel
-        self._types: tuple[Any, ...] = ()
+        self._knows_types = False
         self._lock = threading.Lock()
 
     def launch(self, size: tuple[int, ...], group: tuple[int, ...] | None, *arguments: Any) -> None:
-        """Enqueue the kernel: global and local size, then buffers, NumPy scalars and (1,) records. None: the driver picks a local size."""
-        types = tuple(None if isinstance(argument, cl.Buffer) else argument.dtype for argument in arguments)
+        """Enqueue the kernel: global and local size (None: the driver picks one), then buffers, NumPy scalars and (1,) records, each
+        of the same type at every launch."""
         with self._lock:
-            if types != self._types:
-                self._kernel.set_scalar_arg_dtypes(types)
-                self._types = types
+            if not self._knows_types:
+                self._kernel.set_scalar_arg_dtypes([None if isinstance(given, cl.Buffer) else given.dtype for given in arguments])
+                self._knows_types = True
             self._kernel(self._queue, size, group, *arguments)
 
 
@@ -105,6 +105,11 @@ class Device:
         if found is None:
             found = self._shared_kernels[key] = SharedKernel(self.queue, self.kernel(name, **defines))
         return found
+
+    @property
+    def built_kernels(self) -> tuple[tuple[str, dict[str, int]], ...]:
+        """Name and defines of each kernel that was built: what no scene has asked for is not among them."""
+        return tuple((name, dict(defines)) for name, defines in self._programs)
 
     def build(self, text: str, name: str, **defines: int) -> cl.Program:
         """Compile OpenCL C with the kernels' include path. Raises KernelBuildError."""

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 import pyopencl as cl
 
-from gi_core.arrays import Float64, UInt8, UInt16
+from gi_core.arrays import AnyArray, Float64, UInt8, UInt16
 from gi_core.constants import SURFEL_CELL_M
 from gi_core.device import Device
 from gi_core.geometry_file import Geometry
@@ -48,11 +48,19 @@ class SunSamples:
         self.place = device.upload(place)
         self.sun_sample = device.upload(np.full(padded, NO_SAMPLE, np.uint8))
         self.sampled_in = device.allocate(2 * padded)
+        self._framed: ShadowPlan | None = None
+        self._frame: AnyArray
 
     @property
     def nbytes(self) -> int:
         """Bytes on the device."""
         return int(self.place.size + self.sun_sample.size + self.sampled_in.size)
+
+    def frame(self, plan: ShadowPlan) -> AnyArray:
+        """(1,) layout.SHADOW_FRAME of the sector, kept until another plan comes."""
+        if plan is not self._framed:
+            self._framed, self._frame = plan, plan.frame(self.resident.sector.index.origin)
+        return self._frame
 
     def read(self) -> tuple[UInt8, UInt16]:
         """(S,) uint8 samples and (S,) uint16 map numbers: a surfel's source is the map when its number is the map's, its last sample
@@ -135,16 +143,15 @@ class ShadowMap:
             return
         if self.number == 1:  # the first map, or the first after numbers ran out: older samples say nothing
             cl.enqueue_fill_buffer(self._device.queue, samples.sampled_in, np.uint16(0), 0, samples.sampled_in.size)
-        origin = resident.sector.index.origin
         self._sample.launch(
             (-(-samples.groups // GROUP) * GROUP,),
             (GROUP,),
             np.uint32(samples.groups),
-            plan.frame(origin),
+            samples.frame(plan),
             samples.place,
             resident.surfel_normal,
             self._front,
-            np.float32(self._top_m - origin[1]),
+            np.float32(self._top_m),
             np.float32(min(plan.reach_height_m, 1e9)),
             np.uint16(self.number),
             np.uint16(self._drawn_for[0][0]),
