@@ -1,6 +1,7 @@
 """OpenCL device: which one, its queue, and kernels built for what a scene needs."""
 
 import os
+import threading
 import warnings
 from functools import lru_cache
 from typing import Any
@@ -45,6 +46,34 @@ def choose_device(name: str | None) -> cl.Device:
     return next((d for d in devices if "portable computing" in d.platform.name.lower()), devices[0])
 
 
+class SharedKernel:
+    """A kernel that everyone launches with arguments of their own. An instance for each would take half a millisecond to make.
+
+    A kernel is always launched with the same local size: PoCL compiles it anew for each, and would choose one for every global size.
+
+    pyopencl is told what the arguments are: left to find out, it raises and catches a C++ exception for each number, 12 us apiece.
+    """
+
+    def __init__(self, queue: cl.CommandQueue, kernel: cl.Kernel) -> None:
+        self._queue = queue
+        self._kernel = kernel
+        self._knows_types = False
+        self._lock = threading.Lock()
+
+    def launch(self, size: tuple[int, ...], group: tuple[int, ...] | None, *arguments: Any) -> None:
+        """Enqueue the kernel: global and local size (None: the driver picks one), then buffers, NumPy scalars and (1,) records, each
+        of the same type at every launch."""
+        with self._lock:
+            if not self._knows_types:
+                self._kernel.set_scalar_arg_dtypes([None if isinstance(given, cl.Buffer) else given.dtype for given in arguments])
+                self._knows_types = True
+            self._kernel(self._queue, size, group, *arguments)
+
+    def launch_1d(self, items: int, *arguments: Any) -> None:
+        """Enqueue the kernel for some work-items, rounded up to whole work-groups of GROUP: kernels guard against the excess."""
+        self.launch((-(-items // GROUP) * GROUP,), (GROUP,), *arguments)
+
+
 class Device:
     """A device with an in-order queue, and the programs built for it so far."""
 
@@ -55,6 +84,7 @@ class Device:
         self.context = cl.Context([self.device])
         self.queue = cl.CommandQueue(self.context)
         self._programs: dict[tuple[str, tuple[tuple[str, int], ...]], cl.Program] = {}
+        self._shared_kernels: dict[tuple[object, ...], SharedKernel] = {}
         try:
             self._check_layout()
         except KernelBuildError as error:
@@ -71,6 +101,22 @@ class Device:
         if key not in self._programs:
             self._programs[key] = self.build(source(f"{name}.cl"), f"{name}.cl", **defines)
         return cl.Kernel(self._programs[key], name)
+
+    def shared_kernel(self, name: str, **defines: int) -> SharedKernel:
+        """The kernel ``name`` of ``name.cl`` that all of the process launch, built at the first call; defines in the same order each time.
+
+        Raises KernelBuildError with the compiler's log.
+        """
+        key = (name, *defines.items())
+        found = self._shared_kernels.get(key)
+        if found is None:
+            found = self._shared_kernels[key] = SharedKernel(self.queue, self.kernel(name, **defines))
+        return found
+
+    @property
+    def built_kernels(self) -> tuple[tuple[str, dict[str, int]], ...]:
+        """Name and defines of each kernel that was built: what no scene has asked for is not among them."""
+        return tuple((name, dict(defines)) for name, defines in self._programs)
 
     def build(self, text: str, name: str, **defines: int) -> cl.Program:
         """Compile OpenCL C with the kernels' include path. Raises KernelBuildError."""
@@ -112,14 +158,6 @@ class Device:
         expected = [record.dtype.itemsize for record in layout.RECORDS]
         if sizes.tolist() != expected:
             raise KernelBuildError(f"{self.name} lays out records in {sizes.tolist()} bytes, the host in {expected}")
-
-
-def run_1d(device: Device, kernel: cl.Kernel, items: int) -> None:
-    """Enqueue a kernel for some work-items, rounded up to whole work-groups of GROUP: kernels guard against the excess.
-
-    Always the same group size: PoCL compiles a kernel anew for each, and would choose one for every number of items.
-    """
-    cl.enqueue_nd_range_kernel(device.queue, kernel, (-(-items // GROUP) * GROUP,), (GROUP,))
 
 
 @lru_cache(maxsize=4)

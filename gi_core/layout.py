@@ -37,6 +37,11 @@ SHADOW_END_M = 0.02
 # A surfel is looked up this far in front of its plane, in metres and in shares of its cell: its position is a mean of hits, which
 # where the surface bends lies below some of it.
 SHADOW_BIAS_M, SHADOW_BIAS_CELLS = 0.05, 0.05
+# A surfel's points that are looked up: 8 or 16.
+SHADOW_TAPS = 8
+# Floats from one row of the map to the next: 64 bytes more than the 1024 texels, so that texels under one another do not all compete for
+# the same places of a cache.
+SHADOW_ROW_TEXELS = 1040
 
 _SCALARS = {"float": "f4", "uint": "u4", "int": "i4"}
 
@@ -183,6 +188,8 @@ CONSTANTS: dict[str, int | float] = {
     "SHADOW_END_M": SHADOW_END_M,
     "SHADOW_BIAS_M": SHADOW_BIAS_M,
     "SHADOW_BIAS_CELLS": SHADOW_BIAS_CELLS,
+    "SHADOW_TAPS": SHADOW_TAPS,
+    "SHADOW_ROW_TEXELS": SHADOW_ROW_TEXELS,
 }
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pyopencl as cl
 
 from gi_core.arrays import Float32, Float64
-from gi_core.device import Device, run_1d
+from gi_core.device import Device
 from gi_core.light_blend import LightVector
 from gi_core.light_geometry import ShadowGeometry
 from gi_core.light_surfels import SurfelLights
@@ -81,7 +81,6 @@ class LiveSector:
         self._faded = 0
         self._cubes: Float32 = np.zeros((sector.probe_count, sector.basis_size, 3), np.float32)
         self._shown: cl.Buffer | None = None
-        self._kernels: dict[bool, cl.Kernel] = {}
         self._first: cl.Buffer | None = None
         self._room: cl.Buffer | None = None
         self._blended_at = -1
@@ -193,15 +192,12 @@ class LiveSector:
         arguments: list[object] = [np.uint32(rows), resident.cubes]
         if gains:
             self._first = self._first or device.allocate(16 * rows)
-            resident.gather_first_bounce(self._first)
+            resident.enqueue_first_bounce(self._first)
             arguments += [self._first, np.float32(settings.bounce_factor)]
-        if gains not in self._kernels:
-            self._kernels[gains] = device.kernel("show_probes", CUBE_ROWS=sector.basis_size, HAS_BOUNCE_FACTOR=int(gains))
-        kernel = self._kernels[gains]
+        kernel = device.shared_kernel("show_probes", CUBE_ROWS=sector.basis_size, HAS_BOUNCE_FACTOR=int(gains))
         uploads = device.upload(ambient), device.upload(standing_in)
-        kernel.set_args(*arguments, self._room, *uploads, np.float32(self._faded / FADE_TICKS), self._shown)
         if rows:
-            run_1d(device, kernel, rows)
+            kernel.launch_1d(rows, *arguments, self._room, *uploads, np.float32(self._faded / FADE_TICKS), self._shown)
 
 
 def _bounds(sector: Sector) -> tuple[Float64, Float64]:

@@ -1,4 +1,4 @@
-"""The relighter in NumPy, written to be read and to be trusted: twin of light_bricks.cl, bounce_bricks.cl,
+"""The relighter in NumPy, written to be read and to be trusted: twin of sun_on_surfels.cl, light_bricks.cl, bounce_bricks.cl,
 gather_probes.cl and fill_volume.cl.
 
 With dtype float64 it is also the solver that the kernels are judged by.
@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from gi_core.ambient_cube import basis_weights
-from gi_core.arrays import AnyArray, Float64
+from gi_core.arrays import AnyArray, Float64, UInt8
 from gi_core.constants import SNOW_ALBEDO
+from gi_core.layout import NO_SAMPLE, WHOLE_SAMPLE
 from gi_core.relight_input import RelightInput
 from gi_core.sector import Sector, counts
 
@@ -21,14 +22,19 @@ def sun_bits(sector: Sector, plane: int) -> AnyArray:
     return np.unpackbits(octets, bitorder="little")[: sector.surfel_count]
 
 
-def directional_irradiance(sector: Sector, given: RelightInput, dtype: Any = np.float32) -> AnyArray:
-    """Sun and moon on each surfel: (S, 3) [lx]. It does not change from pass to pass."""
+def directional_irradiance(sector: Sector, given: RelightInput, dtype: Any = np.float32, sun_sample: UInt8 | None = None) -> AnyArray:
+    """Sun and moon on each surfel: (S, 3) [lx]. It does not change from pass to pass.
+
+    sun_sample : (S,) of the sun's shadow map, layout.NO_SAMPLE where a surfel has none
+    """
     total = np.zeros((sector.surfel_count, 3), dtype)
-    for light in given.lights:
+    for number, light in enumerate(given.lights):
         cosine = np.maximum(np.einsum("sa,a->s", sector.surfel_normal.astype(dtype), light["direction"][:3].astype(dtype)), 0)
         visibility = np.zeros(sector.surfel_count, dtype)
         for plane, weight in zip(light["plane"], light["plane_weight"], strict=True):
             visibility += dtype(weight) * sun_bits(sector, int(plane))
+        if sun_sample is not None and number == 0:
+            visibility = np.where(sun_sample == NO_SAMPLE, visibility, sun_sample.astype(dtype) / dtype(WHOLE_SAMPLE))
         total += (cosine * visibility)[:, None] * light["irradiance"][:3].astype(dtype)
     return total
 
@@ -48,9 +54,11 @@ def brick_means(sector: Sector, exitance: AnyArray) -> AnyArray:
     return np.asarray(sums / counts(sector.brick_starts)[:, None].astype(exitance.dtype))
 
 
-def light_bricks(sector: Sector, given: RelightInput, lamps: AnyArray | None = None, dtype: Any = np.float32) -> AnyArray:
+def light_bricks(
+    sector: Sector, given: RelightInput, lamps: AnyArray | None = None, dtype: Any = np.float32, sun_sample: UInt8 | None = None
+) -> AnyArray:
     """(N, 3) [lx]: what bricks send out of the light of sun, moon, lamps (S, 3) [lx] and their own emission, before any bounce."""
-    irradiance = directional_irradiance(sector, given, dtype) + (0 if lamps is None else lamps.astype(dtype))
+    irradiance = directional_irradiance(sector, given, dtype, sun_sample) + (0 if lamps is None else lamps.astype(dtype))
     exitance = snowed_albedo(sector, given.snow, dtype) * irradiance
     if sector.surfel_emission is not None:
         exitance += dtype(np.pi) * sector.surfel_emission.astype(dtype)
@@ -79,10 +87,19 @@ def gather_probes(sector: Sector, exitance: AnyArray, dtype: Any = np.float32) -
 
 
 def relight(
-    sector: Sector, given: RelightInput, cubes: AnyArray, passes: int, dtype: Any = np.float32, lamps: AnyArray | None = None
+    sector: Sector,
+    given: RelightInput,
+    cubes: AnyArray,
+    passes: int,
+    dtype: Any = np.float32,
+    lamps: AnyArray | None = None,
+    sun_sample: UInt8 | None = None,
 ) -> AnyArray:
-    """Cubes (P, B, 3) [lx] after some passes, starting from others; each pass adds a bounce. lamps : (S, 3) [lx] on each surfel."""
-    direct = light_bricks(sector, given, lamps, dtype)
+    """Cubes (P, B, 3) [lx] after some passes, starting from others; each pass adds a bounce.
+
+    lamps : (S, 3) [lx] on each surfel; sun_sample : as ``directional_irradiance`` takes it
+    """
+    direct = light_bricks(sector, given, lamps, dtype, sun_sample)
     patches = given.patch_exitance.astype(dtype)
     for _ in range(passes):
         exitance = np.concatenate([direct + bounce_bricks(sector, given, cubes, dtype), patches])

@@ -15,12 +15,12 @@ import pyopencl as cl
 
 from gi_core import relight_twin
 from gi_core.arrays import AnyArray, Float32, UInt32
-from gi_core.device import Device, run_1d
+from gi_core.device import Device
 from gi_core.layout import BOUNCE
 from gi_core.relight_input import RelightInput
 from gi_core.sector import Sector, starts
 
-VOXEL_GROUP = (8, 4, 1)  # work-items of fill_volume.cl along x, y, z; see run_1d
+VOXEL_GROUP = (8, 4, 1)  # work-items of fill_volume.cl along x, y, z; see SharedKernel
 WEIGHTS_PER_VECTOR = 4
 SURFELS_PER_GROUP = 8  # of sun_on_surfels.cl: a byte of a plane's bits
 
@@ -53,7 +53,7 @@ class ResidentSector:
         self.brick_emission = None if sector.surfel_emission is None else device.upload(_brick_emission(sector))
         self.factor_starts = device.upload(sector.factor_starts)
         self.factor_source = device.upload(sector.factor_source)
-        self.factor_weight = device.upload(whole_vectors(sector.factor_weight))
+        self.factor_weight = device.upload(padded_weights(sector.factor_weight))
         self.voxel_probe = device.upload(sector.voxel_probe)
         self.voxel_weight = device.upload(sector.voxel_weight)
         self.cubes = device.allocate(sector.probe_count * sector.basis_size * 16)
@@ -66,12 +66,11 @@ class ResidentSector:
         self.bounce_starts: cl.Buffer | None = None
         self.sun_sample: cl.Buffer | None = None
         self._lamps: cl.Buffer | None = None
+        self._sky_patches = sky_patches
         self._has_snow = bool(sector.surfel_snow.any())
         self._light: LightOnDevice | None = None
         self._direct_of: object = None
         self._bounces_of: float | None = None
-        self._kernels: dict[tuple[object, ...], cl.Kernel] = {}
-        self._pass: list[tuple[cl.Kernel, int]] = []
 
     @property
     def nbytes(self) -> int:
@@ -115,11 +114,9 @@ class ResidentSector:
         """Enqueue what the passes need to know of the light; nothing when it is as it was."""
         if self.sector.probe_count == 0:
             return
-        if light is not self._light:
-            behind = self.sector.brick_count * 16
-            for sources in (self.exitance, self.direct):
-                cl.enqueue_copy(self.device.queue, sources, light.patches, byte_count=light.patches.size, dst_offset=behind)
-            self._light = light
+        if light is not self._light and len(light.given.patch_exitance) != self._sky_patches:
+            raise ValueError(f"expected the exitance of {self._sky_patches} sky patches, got {len(light.given.patch_exitance)}")
+        self._light = light
         if self.sector.brick_count == 0:
             return
         snow = light.given.snow if self._has_snow else 0.0
@@ -133,16 +130,26 @@ class ResidentSector:
             self._direct_of = light.identity
 
     def enqueue_pass(self) -> None:
-        """Enqueue one pass: one more bounce on the cubes that the sector holds."""
-        if not self._pass:
-            self._pass = self._bind_pass()
-        for kernel, items in self._pass:
-            run_1d(self.device, kernel, items)
+        """Enqueue one pass: one more bounce on the cubes that the sector holds. ``light`` comes first."""
+        self._enqueue_pass(self.bounce_starts or self.direct, self.cubes)
 
-    def gather_first_bounce(self, cubes: cl.Buffer) -> None:
+    def enqueue_first_bounce(self, cubes: cl.Buffer) -> None:
         """Enqueue what one pass from darkness gives, into other cubes than the sector's own: sky and the first surface alone."""
-        if self.sector.probe_count:
-            run_1d(self.device, self._gather("first", self.direct, cubes), self.sector.probe_count)
+        self._enqueue_pass(self.device.allocate(4 * (self.sector.brick_count + 1)), cubes)  # no brick has a bounce
+
+    def _enqueue_pass(self, bounce_starts: cl.Buffer, cubes: cl.Buffer) -> None:
+        sector, light = self.sector, self._light
+        if sector.probe_count == 0:
+            return
+        assert light is not None
+        patches = len(light.given.patch_exitance)
+        arguments: list[Any] = [np.uint32(sector.brick_count), bounce_starts, self.bounces or self.direct, self.direct]
+        arguments += [self.cubes, np.uint32(patches), light.patches, self.exitance]
+        self.device.shared_kernel("bounce_bricks").launch_1d(sector.brick_count + patches, *arguments)
+        vectors = -(-sector.basis_size // WEIGHTS_PER_VECTOR)
+        kernel = self.device.shared_kernel("gather_probes", BASIS_SIZE=sector.basis_size, WEIGHT_VECTORS=vectors)
+        factors = (self.factor_starts, self.factor_source, self.factor_weight)
+        kernel.launch_1d(sector.probe_count, np.uint32(sector.probe_count), *factors, self.exitance, cubes)
 
     def fill_volume(self, box: AnyArray, size: tuple[int, ...], target: cl.Buffer, cubes: cl.Buffer | None = None) -> None:
         """Enqueue this sector's part of a volume: ``box`` (1,) layout.VOLUME_BOX, its size (x, y, z), the volume's buffer.
@@ -150,10 +157,9 @@ class ResidentSector:
         ``cubes`` are shown in place of the sector's own.
         """
         sector = self.sector
-        kernel = self._kernel("fill_volume", BASIS_SIZE=sector.basis_size, VOXEL_PROBES=sector.voxel_probe.shape[3])
-        kernel.set_args(box, self.voxel_probe, self.voxel_weight, self.cubes if cubes is None else cubes, target)
+        kernel = self.device.shared_kernel("fill_volume", BASIS_SIZE=sector.basis_size, VOXEL_PROBES=sector.voxel_probe.shape[3])
         whole = tuple(-(-count // group) * group for count, group in zip(size, VOXEL_GROUP, strict=True))
-        cl.enqueue_nd_range_kernel(self.device.queue, kernel, whole, VOXEL_GROUP)
+        kernel.launch(whole, VOXEL_GROUP, box, self.voxel_probe, self.voxel_weight, self.cubes if cubes is None else cubes, target)
 
     def read_cubes(self) -> Float32:
         """The probes' cubes (P, B, 3) float32 [lx], after all that was enqueued."""
@@ -168,30 +174,22 @@ class ResidentSector:
             padded[..., :3] = cubes
             cl.enqueue_copy(self.device.queue, self.cubes, padded)
 
-    def _kernel(self, name: str, **defines: int) -> cl.Kernel:
-        # Making a kernel takes longer than running it.
-        key = (name, *defines.values())
-        if key not in self._kernels:
-            self._kernels[key] = self.device.kernel(name, **defines)
-        return self._kernels[key]
-
     def _light_surfels(self, light: LightOnDevice) -> None:
         count = len(light.given.lights)
         if self.sun_visibility is None:
             self.sun_visibility = self.device.upload(self.sector.sun_visibility)
         if self.sun_share is None or self.sun_share.size < count * self._groups * SURFELS_PER_GROUP * 4:
             self.sun_share = self.device.allocate(count * self._groups * SURFELS_PER_GROUP * 4)
-        kernel = self._kernel("sun_on_surfels", DIRECTIONAL_LIGHTS=count, HAS_SUN_MAP=int(self.sun_sample is not None))
+        kernel = self.device.shared_kernel("sun_on_surfels", DIRECTIONAL_LIGHTS=count, HAS_SUN_MAP=int(self.sun_sample is not None))
         arguments: list[Any] = [np.uint32(self._groups), self.surfel_normal, self.sun_visibility]
         arguments += [np.uint32(4 * self.sector.sun_visibility.shape[1]), light.lights]
         if self.sun_sample is not None:
             arguments.append(self.sun_sample)
-        kernel.set_args(*arguments, self.sun_share)
-        run_1d(self.device, kernel, self._groups)
+        kernel.launch_1d(self._groups, *arguments, self.sun_share)
 
     def _light_bricks(self, light: LightOnDevice, snow: float) -> None:
         count = len(light.given.lights)
-        kernel = self._kernel(
+        kernel = self.device.shared_kernel(
             "light_bricks",
             DIRECTIONAL_LIGHTS=count,
             HAS_EMISSION=int(self.brick_emission is not None),
@@ -205,14 +203,13 @@ class ResidentSector:
         arguments.append(self.direct)
         if snow > 0:
             arguments.append(np.float32(snow))
-        kernel.set_args(*arguments)
-        run_1d(self.device, kernel, self.sector.brick_count)
+        kernel.launch_1d(self.sector.brick_count, *arguments)
 
     def _collect_bounces(self, snow: float) -> None:
         """Bounces of the sector under this much snow. Which there are does not depend on the snow: the first time counts them."""
         sector, device = self.sector, self.device
         weighted = sector.feedback_probe.shape[1] > 1 or not (sector.feedback_weight == 1).all()
-        kernel = self._kernel(
+        kernel = self.device.shared_kernel(
             "collect_bounces",
             FEEDBACK_PROBES=sector.feedback_probe.shape[1],
             HAS_FEEDBACK_WEIGHTS=int(weighted),
@@ -225,10 +222,9 @@ class ResidentSector:
         def collect(bounce_starts: cl.Buffer, bounces: cl.Buffer) -> None:
             last = [np.float32(snow)] if snow > 0 else []
             surfels = [self.surfel_albedo, self.surfel_normal, np.uint32(self._groups * SURFELS_PER_GROUP)]
-            kernel.set_args(
-                np.uint32(sector.brick_count), self.brick_starts, *surfels, probe, *weight, bounce_starts, bounces, count, *last
-            )
-            run_1d(self.device, kernel, sector.brick_count)
+            bricks = np.uint32(sector.brick_count)
+            written = (bounce_starts, bounces, count)
+            kernel.launch_1d(sector.brick_count, bricks, self.brick_starts, *surfels, probe, *weight, *written, *last)
 
         if self.bounce_starts is None:
             most = 3 * sector.feedback_probe.shape[1]
@@ -242,28 +238,6 @@ class ResidentSector:
         assert self.bounces is not None
         collect(self.bounce_starts, self.bounces)
 
-    def _bind_pass(self) -> list[tuple[cl.Kernel, int]]:
-        sector = self.sector
-        bound: list[tuple[cl.Kernel, int]] = []
-        if sector.probe_count and sector.brick_count:
-            kernel = self._kernel("bounce_bricks")
-            kernel.set_args(np.uint32(sector.brick_count), self.bounce_starts, self.bounces, self.direct, self.cubes, self.exitance)
-            bound.append((kernel, sector.brick_count))
-        if sector.probe_count:
-            bound.append((self._gather("pass", self.exitance, self.cubes), sector.probe_count))
-        return bound
-
-    def _gather(self, use: str, sources: cl.Buffer, cubes: cl.Buffer) -> cl.Kernel:
-        """gather_probes.cl from other sources into other cubes: a kernel for each use, since arguments stay bound."""
-        sector = self.sector
-        defines = {"BASIS_SIZE": sector.basis_size, "WEIGHT_VECTORS": -(-sector.basis_size // WEIGHTS_PER_VECTOR)}
-        key = ("gather_probes", use)
-        if key not in self._kernels:
-            self._kernels[key] = self.device.kernel("gather_probes", **defines)
-        kernel = self._kernels[key]
-        kernel.set_args(np.uint32(sector.probe_count), self.factor_starts, self.factor_source, self.factor_weight, sources, cubes)
-        return kernel
-
 
 def _brick_emission(sector: Sector) -> Float32:
     """(N, 4) float32 [lx]: pi times the mean emission of each brick's surfels."""
@@ -272,6 +246,6 @@ def _brick_emission(sector: Sector) -> Float32:
     return np.pad(np.float32(np.pi) * means, ((0, 0), (0, 1)))
 
 
-def whole_vectors(weights: Float32) -> Float32:
-    """Factor weights (F, B) padded with zeros to whole float4: (F, 4 n)."""
-    return np.pad(weights, ((0, 0), (0, -weights.shape[1] % WEIGHTS_PER_VECTOR)))
+def padded_weights(weights: Float32) -> Float32:
+    """Factor weights (F, B) in one row, and behind them zeros for the last factor's vectors to reach into."""
+    return np.concatenate([weights.reshape(-1), np.zeros(2 * WEIGHTS_PER_VECTOR, np.float32)])

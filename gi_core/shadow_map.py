@@ -12,9 +12,9 @@ import pyopencl as cl
 
 from gi_core.arrays import AnyArray, Float32, Float64, UInt8, UInt16
 from gi_core.constants import SURFEL_CELL_M
-from gi_core.device import Device, run_1d
+from gi_core.device import Device
 from gi_core.grid import SectorIndex
-from gi_core.layout import NO_SAMPLE
+from gi_core.layout import NO_SAMPLE, SHADOW_ROW_TEXELS
 from gi_core.resident_sector import SURFELS_PER_GROUP, ResidentSector
 from gi_core.sector import counts
 from gi_core.shadow_plan import MAP_TEXELS, ShadowPlan, box_corners, oldest_fresh, triangle_records
@@ -31,25 +31,35 @@ LAST_NUMBER = 0xFFFF
 class SunSamples:
     """One resident sector's samples: share of the sun, and which map said so. 19 bytes a surfel; none before the first map.
 
-    sun_sample : (S padded to whole groups,) uint8 on the device: share of layout.WHOLE_SAMPLE, or NO_SAMPLE
-    sampled_in : (S,) uint16 on the device: the number of the map that a sample is from, 0 before any
+    sun_sample : (S padded to whole groups of eight,) uint8 on the device: share of layout.WHOLE_SAMPLE, or NO_SAMPLE
+    sampled_in : (S padded,) uint16 on the device: the number of the map that a sample is from, 0 before any
     """
 
     def __init__(self, device: Device, resident: ResidentSector) -> None:
         sector = resident.sector
-        place = np.empty((sector.surfel_count, 4), np.float32)
-        place[:, :3] = sector.surfel_position
-        place[:, 3] = np.repeat(SURFEL_CELL_M * 2.0 ** sector.brick_level.astype(np.float32), counts(sector.brick_starts))
+        self.groups = -(-sector.surfel_count // SURFELS_PER_GROUP)
+        padded = self.groups * SURFELS_PER_GROUP
+        place = np.zeros((4, padded), np.float32)
+        place[:3, : sector.surfel_count] = sector.surfel_position.T
+        cell = SURFEL_CELL_M * 2.0 ** sector.brick_level.astype(np.float32)
+        place[3, : sector.surfel_count] = np.repeat(cell, counts(sector.brick_starts))
         self.resident = resident
         self.place = device.upload(place)
-        padded = -(-sector.surfel_count // SURFELS_PER_GROUP) * SURFELS_PER_GROUP
         self.sun_sample = device.upload(np.full(padded, NO_SAMPLE, np.uint8))
-        self.sampled_in = device.allocate(2 * sector.surfel_count)
+        self.sampled_in = device.allocate(2 * padded)
+        self._framed: ShadowPlan | None = None
+        self._frame: AnyArray
 
     @property
     def nbytes(self) -> int:
         """Bytes on the device."""
         return int(self.place.size + self.sun_sample.size + self.sampled_in.size)
+
+    def frame(self, plan: ShadowPlan) -> AnyArray:
+        """(1,) layout.SHADOW_FRAME of the sector, kept until another plan comes."""
+        if plan is not self._framed:
+            self._framed, self._frame = plan, plan.frame(self.resident.sector.index.origin)
+        return self._frame
 
     def read(self) -> tuple[UInt8, UInt16]:
         """(S,) uint8 samples and (S,) uint16 map numbers: a surfel's source is the map when its number is the map's, its last sample
@@ -75,17 +85,18 @@ class ShadowMap:
         self._top_m = top_m
         self._drawing: ShadowPlan | None = None
         self._left: list[SectorIndex] = []
-        self._front, self._back = (cl.Buffer(device.context, cl.mem_flags.READ_WRITE, 4 * MAP_TEXELS**2) for _ in range(2))
-        self._draw = device.kernel("draw_shadow_map")
-        self._sample = device.kernel("sample_shadow_map")
+        self._front, self._back = (cl.Buffer(device.context, cl.mem_flags.READ_WRITE, 4 * MAP_TEXELS * SHADOW_ROW_TEXELS) for _ in range(2))
+        self._draw = device.shared_kernel("draw_shadow_map")
+        self._sample = device.shared_kernel("sample_shadow_map")
         self._bands = CPU_BANDS if device.device.type & cl.device_type.CPU else GPU_BANDS
         self._triangles: OrderedDict[SectorIndex, tuple[cl.Buffer, int]] = OrderedDict()
+        self._kept_bytes = 0
         self._drawn_for: list[tuple[int, Float64]] = []
 
     @property
     def nbytes(self) -> int:
         """Bytes on the device."""
-        return int(self._front.size + self._back.size + sum(buffer.size for buffer, _ in self._triangles.values()))
+        return int(self._front.size + self._back.size + self._kept_bytes)
 
     @property
     def is_drawing(self) -> bool:
@@ -133,42 +144,41 @@ class ShadowMap:
             return
         if self.number == 1:  # the first map, or the first after numbers ran out: older samples say nothing
             cl.enqueue_fill_buffer(self._device.queue, samples.sampled_in, np.uint16(0), 0, samples.sampled_in.size)
-        origin = resident.sector.index.origin
-        self._sample.set_args(
-            plan.frame(origin),
-            np.uint32(resident.sector.surfel_count),
+        self._sample.launch_1d(
+            samples.groups,
+            np.uint32(samples.groups),
+            samples.frame(plan),
             samples.place,
             resident.surfel_normal,
-            np.uint32(samples.sun_sample.size),
             self._front,
-            np.float32(self._top_m - origin[1]),
+            np.float32(self._top_m),
             np.float32(min(plan.reach_height_m, 1e9)),
             np.uint16(self.number),
             np.uint16(self._drawn_for[0][0]),
             samples.sun_sample,
             samples.sampled_in,
         )
-        run_1d(self._device, self._sample, resident.sector.surfel_count)
         resident.set_sun_sample(samples.sun_sample)
 
     def read(self) -> Float32:
         """The map that surfels look at: (MAP_TEXELS, MAP_TEXELS) float32 [m], rows, columns."""
-        depth = np.zeros((MAP_TEXELS, MAP_TEXELS), np.float32)
-        self._device.read(self._front, depth)
-        return depth
+        rows = np.zeros((MAP_TEXELS, SHADOW_ROW_TEXELS), np.float32)
+        self._device.read(self._front, rows)
+        return rows[:, :MAP_TEXELS].copy()
 
     def _enqueue(self, plan: ShadowPlan, origin: Float64, triangles: cl.Buffer, count: int) -> None:
         if count:
             rows = np.int32(-(-MAP_TEXELS // self._bands))
-            self._draw.set_args(plan.frame(origin), np.uint32(count), triangles, rows, self._back)
-            cl.enqueue_nd_range_kernel(self._device.queue, self._draw, (self._bands,), (1,))
+            self._draw.launch((self._bands,), (1,), plan.frame(origin), np.uint32(count), triangles, rows, self._back)
 
     def _on_device(self, index: SectorIndex) -> tuple[cl.Buffer, int]:
         found = self._triangles.pop(index, None)
         if found is None:
             records = self._casters(index)
             found = self._device.upload(records), len(records)
+            self._kept_bytes += found[0].size
+            while self._triangles and self._kept_bytes > KEPT_BYTES:
+                _, (gone, _) = self._triangles.popitem(last=False)
+                self._kept_bytes -= gone.size
         self._triangles[index] = found
-        while len(self._triangles) > 1 and sum(buffer.size for buffer, _ in self._triangles.values()) > KEPT_BYTES:
-            self._triangles.popitem(last=False)
         return found

@@ -3,19 +3,22 @@
 import numpy as np
 
 from gi_core.arrays import AnyArray, Bool, Float32, Float64, UInt8
-from gi_core.layout import SHADOW_BIAS_CELLS, SHADOW_BIAS_M, WHOLE_SAMPLE
+from gi_core.layout import SHADOW_BIAS_CELLS, SHADOW_BIAS_M, SHADOW_TAPS, WHOLE_SAMPLE
 from gi_core.shadow_plan import MAP_TEXELS, TEXELS_PER_METRE, ShadowPlan
 
 NOTHING_DRAWN = np.float32(-1e30)
 LEAST_COSINE = 0.01
-TAPS = 4
+# Hammersley's points on the square -1..1: (SHADOW_TAPS, 2), across and down.
+TAPS = np.array([[i, int(f"{i:0{SHADOW_TAPS.bit_length() - 1}b}"[::-1], 2)] for i in range(SHADOW_TAPS)]) * 2 / SHADOW_TAPS
+TAPS += 1 / SHADOW_TAPS - 1
 
 
-def map_from_world(plan: ShadowPlan, points: Float64) -> Float64:
-    """Columns, rows [texels] and depths [m] (..., 3) of world points (..., 3) [m]."""
-    local = points - plan.middle
-    on_map = local @ np.stack([plan.across, plan.down], axis=1) * TEXELS_PER_METRE + MAP_TEXELS / 2
-    return np.concatenate([on_map, (local @ plan.to_sun)[..., None]], axis=-1)
+def map_from_world(plan: ShadowPlan, points: AnyArray) -> AnyArray:
+    """Columns, rows [texels] and depths [m] (..., 3) of world points (..., 3) [m], in the points' own precision."""
+    local = (points - plan.middle).astype(points.dtype)
+    on_map = local @ np.stack([plan.across, plan.down, plan.to_sun], axis=1).astype(points.dtype)
+    on_map[..., :2] = on_map[..., :2] * TEXELS_PER_METRE + MAP_TEXELS / 2
+    return np.asarray(on_map)
 
 
 def draw(plan: ShadowPlan, corners: Float64) -> Float32:
@@ -39,27 +42,30 @@ def draw(plan: ShadowPlan, corners: Float64) -> Float32:
     return depth.astype(np.float32)
 
 
-def sample(plan: ShadowPlan, depth: Float32, position: Float64, normal: Float32, size: Float32, top_m: float) -> tuple[UInt8, Bool]:
+def sample(plan: ShadowPlan, depth: Float32, position: AnyArray, normal: Float32, size: Float32, top_m: float) -> tuple[UInt8, Bool]:
     """Samples (S,) uint8 of surfels at positions (S, 3) [m], world frame, with normals (S, 3) and cells of size (S,) [m]; and whether
-    each is valid (S,): where it is not, the sample means nothing. Those that face away from the sun are valid, and 0."""
-    cosine = normal @ plan.to_sun
+    each is valid (S,): where it is not, the sample means nothing. Those that face away from the sun are valid, and 0.
+
+    Worked out in the positions' precision.
+    """
+    normal = normal.astype(position.dtype)
+    to_map = np.stack([plan.across, plan.down, plan.to_sun], axis=1).astype(position.dtype)
+    across, down, cosine = (normal @ to_map).T
     bias = SHADOW_BIAS_M + SHADOW_BIAS_CELLS * size
     middle = map_from_world(plan, position + bias[:, None] * normal)
-    across, down = normal @ plan.across, normal @ plan.down
     spread = size / 2 * TEXELS_PER_METRE
     steep = np.maximum(1 - cosine**2, 1e-6)
-    taps = ((np.arange(TAPS) + 0.5) * 2 / TAPS - 1)[:, None]
-    lit: AnyArray = np.zeros(len(position))
-    for tap in np.indices((TAPS, TAPS)).reshape(2, -1).T:
-        a, b = taps[tap[1], 0] * spread, taps[tap[0], 0] * spread
+    lit: AnyArray = np.zeros(len(position), np.int32)
+    for tap in TAPS.astype(position.dtype):
+        a, b = tap[0] * spread, tap[1] * spread
         slant = np.where(1 - cosine**2 > 1e-6, (a * across + b * down) * (1 - cosine) / steep, 0)
         texel = np.floor(middle[:, :2] + np.stack([a - slant * across, b - slant * down], axis=1)).astype(int)
-        step = texel + 0.5 - middle[:, :2]
+        step = (texel + 0.5).astype(position.dtype) - middle[:, :2]
         expected = middle[:, 2] - (step[:, 0] * across + step[:, 1] * down) / np.maximum(cosine, LEAST_COSINE) / TEXELS_PER_METRE
         column, row = np.clip(texel, 0, MAP_TEXELS - 1).T
         lit += expected >= depth[row, column]
     inside = ((middle[:, :2] - spread[:, None] >= 0) & (middle[:, :2] + spread[:, None] < MAP_TEXELS)).all(axis=1)
     valid = inside & (position[:, 1] + plan.reach_height_m >= top_m)
     away = cosine <= LEAST_COSINE
-    share = np.where(away, 0, (lit * WHOLE_SAMPLE + TAPS * TAPS // 2) // (TAPS * TAPS))
+    share = np.where(away, 0, (lit * WHOLE_SAMPLE + SHADOW_TAPS // 2) // SHADOW_TAPS)
     return share.astype(np.uint8), np.asarray(valid | away)

@@ -62,7 +62,7 @@ __kernel void draw_shadow_map(
             if (!(left <= right))
                 continue;
             const float depth_at_zero = p0.z + depth_by_row * (y - p0.y) + depth_by_column * (0.5f - p0.x);
-            __global float *line = map + row * size;
+            __global float *line = map + row * SHADOW_ROW_TEXELS;
             for (int column = (int)left + ((int)left < left); column <= (int)right; ++column) {
                 const float depth = depth_at_zero + depth_by_column * column;
                 if (depth > line[column])

@@ -19,6 +19,7 @@
 #endif
 
 #include "layout.h"
+#include "vectors.h"
 
 __kernel void sun_on_surfels(
     const uint groups,
@@ -46,8 +47,8 @@ __kernel void sun_on_surfels(
         }
 #if HAS_SUN_MAP
         if (i == 0) {
-            const int8 sample = convert_int8(sun_sample[group]);
-            visible = sample == NO_SAMPLE ? visible : convert_float8(sample) * (1.0f / WHOLE_SAMPLE);
+            const int8 sample = TO_INTS(sun_sample[group]);
+            visible = sample == NO_SAMPLE ? visible : TO_FLOATS(sample) * (1.0f / WHOLE_SAMPLE);
         }
 #endif
         const float8 cosine = x * lights[i].direction[0] + y * lights[i].direction[1] + z * lights[i].direction[2];

@@ -24,7 +24,7 @@ def show(measurements: Sequence[Measurement]) -> None:
     """Print one row for each measurement on stdout."""
     table = Table(title="Medians, each beside its baseline in the same run", title_justify="left")
     for name in ("name", "median", "baseline", "ratio", "unit", "what the baseline is", "sizes", "device"):
-        table.add_column(name, justify="right" if name in ("median", "baseline", "ratio") else "left")
+        table.add_column(name, justify="right" if name in ("median", "baseline", "ratio") else "left", no_wrap=name == "name")
     for row in measurements:
         sizes = ", ".join(f"{count:,} {what}" for what, count in row.sizes.items())
         table.add_row(row.name, *(f"{v:,.4g}" for v in (row.median, row.baseline, row.ratio)), row.unit, row.baseline_is, sizes, row.device)

@@ -78,6 +78,22 @@ def test_snow_and_lamps_equal_the_twins(device, make_sector, snow, lamps):
     assert np.abs(found - truth).max() <= 1e-4 * truth.max()
 
 
+@pytest.mark.parametrize("lights", [1, 2])
+def test_samples_of_the_shadow_map_stand_for_the_suns_baked_visibility(device, make_sector, lights):
+    sector, given = make_sector(17), given_light(17, lights)
+    resident = ResidentSector(device, sector, PATCHES)
+    start = np.zeros((sector.probe_count, 6, 3), np.float32)
+    sample = np.random.default_rng(17).integers(0, 256, sector.surfel_count).astype(np.uint8)
+    sample[::3] = layout.NO_SAMPLE
+    resident.set_sun_sample(device.upload(np.pad(sample, (0, -len(sample) % 8))))
+    Relighter(device).relight([resident], given, 2)
+    expected = relight_twin.relight(sector, given, start, 2, sun_sample=sample)
+    peak = expected.max()
+    np.testing.assert_allclose(resident.read_cubes() / peak, expected / peak, atol=CLOSE)
+    baked = relight_twin.relight(sector, given, start, 2)
+    assert np.abs(expected - baked).max() > 0.01 * peak
+
+
 def test_snow_comes_and_goes_without_a_trace(device, make_sector):
     resident = ResidentSector(device, make_sector(15), PATCHES)
     before = Relighter(device).converge(resident, given_light(15, 1)).cubes.tobytes()

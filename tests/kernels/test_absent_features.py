@@ -1,0 +1,86 @@
+"""What a scene does not have has no buffer on the device, and no kernel is built for it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gi_core.device import Device
+from gi_core.layout import DIRECTIONAL_LIGHT
+from gi_core.relight import Relighter
+from gi_core.relight_input import RelightInput
+from gi_core.resident_sector import ResidentSector
+
+PATCHES = 6
+FEATURES = ("HAS_EMISSION", "HAS_SNOW", "HAS_LAMPS")
+
+
+@pytest.fixture
+def fresh() -> Device:
+    """A device for which nothing has been built yet."""
+    return Device()
+
+
+def light(lights: int, snow: float = 0.0) -> RelightInput:
+    records = np.zeros(lights, DIRECTIONAL_LIGHT.dtype)
+    records["direction"][:, 1], records["irradiance"], records["plane_weight"] = 1, 1e5, 0.25
+    return RelightInput(np.full((PATCHES, 3), 1e4, np.float32), records, snow)
+
+
+def plain(make_sector):
+    sector = make_sector(3)
+    one = np.ones_like(sector.feedback_weight)
+    return replace(sector, surfel_snow=np.zeros_like(sector.surfel_snow), feedback_weight=one)
+
+
+def lit(device: Device, sector, given: RelightInput, **features) -> ResidentSector:
+    resident = ResidentSector(device, sector, PATCHES)
+    if "lamps" in features:
+        resident.set_lamps(device.upload(np.ones((sector.surfel_count, 4), np.float32)))
+    if "sample" in features:
+        resident.set_sun_sample(device.upload(np.zeros(-(-sector.surfel_count // 8) * 8, np.uint8)))
+    Relighter(device).relight([resident], given)
+    device.queue.finish()
+    return resident
+
+
+def defines_of(device: Device, kernel: str) -> dict[str, int]:
+    (found,) = (defines for name, defines in device.built_kernels if name == kernel)
+    return found
+
+
+def test_a_sector_under_the_sky_alone_has_nothing_else(fresh, make_sector):
+    resident = lit(fresh, plain(make_sector), light(0))
+    for absent in ("sun_visibility", "sun_share", "sun_sample", "brick_emission"):
+        assert getattr(resident, absent) is None, absent
+    assert {name for name, _ in fresh.built_kernels} == {"collect_bounces", "light_bricks", "bounce_bricks", "gather_probes"}
+    assert defines_of(fresh, "light_bricks") == {"DIRECTIONAL_LIGHTS": 0} | dict.fromkeys(FEATURES, 0)
+    assert defines_of(fresh, "collect_bounces") == {"FEEDBACK_PROBES": 1, "HAS_FEEDBACK_WEIGHTS": 0, "HAS_SNOW": 0}
+
+
+def test_the_sun_alone_brings_its_own_buffers_and_no_shadow_map(fresh, make_sector):
+    resident = lit(fresh, plain(make_sector), light(1))
+    assert resident.sun_visibility is not None
+    assert resident.sun_share is not None
+    assert resident.sun_sample is None
+    assert defines_of(fresh, "sun_on_surfels") == {"DIRECTIONAL_LIGHTS": 1, "HAS_SUN_MAP": 0}
+    assert defines_of(fresh, "light_bricks") == {"DIRECTIONAL_LIGHTS": 1} | dict.fromkeys(FEATURES, 0)
+
+
+@pytest.mark.parametrize("snow_on_surfels", [False, True])
+def test_snowfall_builds_code_only_where_snow_can_lie(fresh, make_sector, snow_on_surfels):
+    sector = make_sector(3) if snow_on_surfels else plain(make_sector)
+    lit(fresh, sector, light(1, snow=0.5))
+    assert defines_of(fresh, "light_bricks")["HAS_SNOW"] == snow_on_surfels
+    assert defines_of(fresh, "collect_bounces")["HAS_SNOW"] == snow_on_surfels
+
+
+def test_lamps_and_samples_are_the_code_and_bytes_that_they_ask_for(fresh, make_sector):
+    sector = plain(make_sector)
+    without = lit(fresh, sector, light(1))
+    lamps = lit(fresh, sector, light(1), lamps=True)
+    assert lamps.nbytes - without.nbytes == 16 * sector.surfel_count
+    sampled = lit(fresh, sector, light(1), sample=True)
+    assert sampled.nbytes - without.nbytes == -(-sector.surfel_count // 8) * 8
+    assert {defines["HAS_LAMPS"] for name, defines in fresh.built_kernels if name == "light_bricks"} == {0, 1}
+    assert {defines["HAS_SUN_MAP"] for name, defines in fresh.built_kernels if name == "sun_on_surfels"} == {0, 1}
