@@ -105,8 +105,8 @@ def sector_slices(box: SectorBox, sector: Sector) -> tuple[AnyArray, slice, slic
 def box_mask(box: SectorBox, sector: Sector) -> UInt8:
     """Voxel classes (y, z, x) of a box. Below what a sector stores is solid."""
     y, z, x = sector_slices(box, sector)
-    mask = sector.voxel_class[y][:, z, x].copy()
-    mask[box.lattice_first[1] + np.arange(box.size[1]) < sector.voxel_first[1]] = VOXEL_SOLID
+    mask: UInt8 = np.take(sector.voxel_class[:, z, x], y, axis=0)
+    mask[: max(int(sector.voxel_first[1] - box.lattice_first[1]), 0)] = VOXEL_SOLID
     return mask
 
 
