@@ -129,7 +129,8 @@ def with_clouds(clear: Float64, beam_on_ground: Float64, cover: float, transmiss
 
 
 def with_fog(sky: Float64, beam: Float64, beam_sine: Float64, fog_density: float) -> tuple[Float64, Float64]:
-    """A map and beams (lights, 3) [lx, facing them] seen through ground fog: dimmed, and what droplets scatter down spread evenly.
+    """A map and beams (lights, 3) [lx, facing them] seen through ground fog: dimmed, and what droplets scatter down spread over the dome
+    in proportion to how much of a ray's way the fog hides, so that a thin fog veils the horizon and leaves the zenith.
 
     beam_sine : (lights,), sines of the lights' elevations; fog_density : extinction [m^-1]
     """
@@ -137,8 +138,11 @@ def with_fog(sky: Float64, beam: Float64, beam_sine: Float64, fog_density: float
     sine = np.maximum(beam_sine, 0.0)[:, None]
     before = horizontal_illuminance(sky) + (beam * sine).sum(axis=0)
     # At 0.02 the path is 50 layers: longer ones leave the fog's extent.
-    seen = sky * np.exp(-depth / np.maximum(map_directions()[..., 1:2], 0.02))
+    kept = np.exp(-depth / np.maximum(map_directions()[..., 1:2], 0.02))
+    seen = sky * kept
     through = beam * np.exp(-depth / np.maximum(sine, 0.02))
     arriving = before / (1 + 0.75 * (1 - DROPLET_ASYMMETRY) * depth)
     spread = np.maximum(arriving - horizontal_illuminance(seen) - (through * sine).sum(axis=0), 0.0)
-    return seen + spread / horizontal_illuminance(np.ones_like(sky)), through
+    veil = np.broadcast_to(1 - kept, sky.shape)
+    # No fog, no veil, and nothing to spread: 0 / 0.
+    return seen + veil * (spread / np.maximum(horizontal_illuminance(veil), 1e-300)), through
