@@ -6,11 +6,11 @@ DEMO_SOURCE ?= procedural:midtown?blocks=2x2&seed=1
 DEMO_DATA ?= demo_city
 PORT ?= 8000
 
-.PHONY: help demo test test-all check bench format clean
+.PHONY: help demo test test-all check lint-docker bench format clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
-	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-11s %s\n", $$1, $$2}'
 
 $(VENV)/.ready: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -19,6 +19,10 @@ $(VENV)/.ready: pyproject.toml
 
 $(VENV)/.judge: $(VENV)/.ready
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev,judge,sky]'
+	@touch $@
+
+$(VENV)/.docker: $(VENV)/.ready
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev,docker]'
 	@touch $@
 
 demo: $(VENV)/.ready ## bake a small procedural city and serve it (Ctrl-C stops the server)
@@ -37,6 +41,10 @@ check: $(VENV)/.ready ## the gate: format, lint, types, tests
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/python -m pytest
+
+lint-docker: $(VENV)/.docker ## lint docker/Dockerfile and docker/compose.yaml
+	$(BIN)/hadolint docker/Dockerfile
+	$(BIN)/compose-lint docker/compose.yaml
 
 bench: $(VENV)/.ready ## timings, each beside its baseline
 	$(BIN)/sectorlight bench

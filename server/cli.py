@@ -13,6 +13,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from gi_core.errors import FormatError, InputError, SectorlightError, SectorMissingError
+from server.cli_loadtest import loadtest
 from server.version import program_version
 
 INTERRUPTED = 130  # 128 + SIGINT, what a shell expects
@@ -151,6 +152,9 @@ def serve(
     from server.settings import Settings
 
     run(dataset, Settings(host=host, port=port, device=device, token_file=token_file))
+
+
+app.command()(loadtest)
 
 
 @app.command()

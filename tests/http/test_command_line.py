@@ -36,7 +36,7 @@ def expect_refusal(done: Any, *words: str) -> None:
 
 
 def test_every_command_has_help(sectorlight: RunCommand) -> None:
-    for command in ([], ["bake"], ["info"], ["serve"], ["compare"], ["bench"]):
+    for command in ([], ["bake"], ["info"], ["serve"], ["compare"], ["bench"], ["loadtest"]):
         done = sectorlight(*command, "--help")
         assert done.returncode == 0
         assert "Usage" in done.stdout
@@ -46,7 +46,7 @@ def test_help_needs_neither_baker_nor_server() -> None:
     check = (
         "import sys; from typer.testing import CliRunner; from server.cli import app;"
         "assert CliRunner().invoke(app, ['--help']).exit_code == 0;"
-        "heavy = {'fastapi', 'pyopencl', 'embreex', 'trimesh', 'scipy'} & set(sys.modules); assert not heavy, heavy"
+        "heavy = {'fastapi', 'pyopencl', 'embreex', 'trimesh', 'scipy', 'httpx', 'websockets'} & set(sys.modules); assert not heavy, heavy"
     )
     subprocess.run([sys.executable, "-c", check], check=True, timeout=60)
 

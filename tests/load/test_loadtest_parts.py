@@ -1,0 +1,157 @@
+"""The load test's arithmetic, files and picture, without a server."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from rich.console import Console
+
+from gi_core.errors import InputError
+from server.loadtest_clients import count_pops, read_reply
+from server.loadtest_command import checked_url, read_paths, table_of
+from server.loadtest_limits import Limits, missed
+from server.loadtest_plot import _round_up, draw
+from server.loadtest_record import Live, Recorder, Setting, percentile, report_of
+from server.stream_header import StreamError
+
+SETTING = Setting(players=2, mode="stream", speed=5.0, pop_bound=0.2, same_clock=True)
+
+
+def some_report(setting: Setting = SETTING, latencies: tuple[float, ...] = (4.0, 6.0, 30.0)) -> dict[str, Any]:
+    recorder = Recorder()
+    recorder.live.append(Live(0.0, {"late_ticks": 5, "ticks": 100, "misses": 1, "tick_ms": {"p50": 1, "p99": 2, "max": 90}}))
+    for number, latency in enumerate(latencies):
+        recorder.message(number + 0.5, 1000, latency)
+    recorder.pops(0.5, 3)
+    recorder.error(1.5, "x")
+    recorder.live.append(Live(3.0, {"late_ticks": 8, "ticks": 190, "misses": 1, "tick_ms": {"p50": 1.5, "p99": 3, "max": 4}}))
+    return report_of(recorder, setting, 3.0, 0.5, False)
+
+
+def test_a_report_sums_up() -> None:
+    report = some_report()
+    assert report["bytes_per_second_per_player"] == 500
+    assert report["volume_ms"] == {"p50": 6.0, "p99": 30.0}
+    assert report["tick_ms"] == {"p50": 1.5, "p99": 3, "max": 90}
+    assert (report["late_ticks"], report["ticks"], report["misses"], report["pops"], report["errors"]) == (3, 90, 0, 3, 1)
+    assert [row["bytes_per_player"] for row in report["per_second"]] == [500, 500, 500]
+    assert [row["errors"] for row in report["per_second"]] == [0, 1, 0]
+    json.dumps(report, allow_nan=False)
+
+
+def test_latencies_of_another_machine_start_at_the_quickest() -> None:
+    other = Setting(2, "stream", 5.0, 0.2, same_clock=False)
+    assert some_report(other)["volume_ms"] == {"p50": 2.0, "p99": 26.0}
+    assert some_report(other)["volume_ms_since"] == "the quickest frame"
+    assert some_report(latencies=(-50.0, -49.0, -40.0))["volume_ms"] == {"p50": 1.0, "p99": 10.0}
+
+
+def test_percentiles_are_values_that_occurred() -> None:
+    assert percentile([3.0, 1.0, 2.0], 0.5) == 2.0
+    assert percentile([1.0] * 99 + [9.0], 0.99) == 1.0
+    assert percentile([1.0] * 98 + [9.0] * 2, 0.99) == 9.0
+    assert percentile([], 0.5) is None
+
+
+def test_errors_are_counted_but_not_all_quoted() -> None:
+    recorder = Recorder()
+    for number in range(1000):
+        recorder.error(0.0, f"error {number}")
+    assert recorder.total("errors") == 1000 == sum(recorder.errors.values())
+    assert len(recorder.errors) <= 21
+
+
+def test_only_great_changes_in_free_air_pop() -> None:
+    before, after = np.full((6, 5, 3), 100, np.float32), np.full((6, 5, 3), 100, np.float32)
+    after[:, 0], after[:, 1], after[:, 2] = 130, 115, 500
+    after[0, 3] = 200  # one face of six: 17 % of the mean
+    before[:, 4] = np.nan
+    classes = np.array([1, 1, 0, 2, 1], np.uint8)
+    assert count_pops(before, after, classes, floor=1.0, basis="cube", bound=0.2) == 1
+    assert count_pops(before, after, classes, floor=1.0, basis="cube", bound=0.1) == 3
+    assert count_pops(after, before, classes, floor=1.0, basis="cube", bound=0.2) == 1
+    assert count_pops(before, after, classes, floor=40.0, basis="cube", bound=0.2) == 0
+
+
+def test_limits_name_what_was_missed() -> None:
+    report = some_report()
+    assert (
+        list(missed(report, Limits(tick_p99_ms=3, late_share=3 / 90, volume_p99_ms=30, megabits=0.004, misses=0, pops=3, errors=1))) == []
+    )
+    lines = list(missed(report, Limits(tick_p99_ms=2.9, late_share=0.03, volume_p99_ms=29, megabits=0.003, misses=0, pops=2, errors=0)))
+    assert [line.split()[0] for line in lines] == [
+        "--max-tick-p99-ms",
+        "--max-late-share",
+        "--max-volume-p99-ms",
+        "--max-megabits",
+        "--max-pops",
+        "--max-errors",
+    ]
+    unknown = report_of(Recorder(), SETTING, 3.0, 0.5, False)
+    assert all("not known" in line for line in missed(unknown, Limits(tick_p99_ms=1, late_share=1, misses=0)))
+    assert len(list(missed(unknown, Limits(tick_p99_ms=1, late_share=1, misses=0)))) == 3
+
+
+def test_units_in_brackets_are_shown(capsys: pytest.CaptureFixture[str]) -> None:
+    report = some_report() | {"error_messages": {"found [/] there": 2}}
+    Console(width=120).print(table_of(report))
+    shown = capsys.readouterr().out
+    assert "p50 / p99 / max [ms]" in shown
+    assert "found [/] there" in shown
+
+
+def test_a_picture_and_a_table_of_any_report() -> None:
+    for report in (some_report(), report_of(Recorder(), SETTING, 0.2, 0.95, True)):
+        assert draw(report).size == (900, 760)
+        assert table_of(report).row_count >= 10
+
+
+@pytest.mark.parametrize(("value", "expected"), [(0, 1), (0.03, 0.05), (0.1, 0.1), (1, 1), (1.1, 2), (33.3, 50), (501, 1000)])
+def test_axes_end_at_round_numbers(value: float, expected: float) -> None:
+    assert _round_up(value) == pytest.approx(expected)
+
+
+def test_path_files(tmp_path: Path) -> None:
+    file = tmp_path / "path.json"
+    file.write_text("[[0, 1, 2], [3, 4, 5.5]]")
+    assert read_paths(file) == [[(0, 1, 2), (3, 4, 5.5)]]
+    file.write_text("[[[0, 1, 2], [3, 4, 5.5]], [[1, 1, 1], [2, 2, 2], [3, 3, 3]]]")
+    assert [len(path) for path in read_paths(file)] == [2, 3]
+    for text in (
+        "",
+        "{}",
+        "[]",
+        "[[]]",
+        "[[0, 1, 2]]",
+        "[[0, 1], [2, 3]]",
+        "[[0, 1, NaN], [0, 1, 2]]",
+        "[[0, 1, true], [0, 1, 2]]",
+        "[1, 2, 3]",
+    ):
+        file.write_text(text)
+        with pytest.raises(InputError, match="--path"):
+            read_paths(file)
+    with pytest.raises(InputError, match="none"):
+        read_paths(tmp_path / "none")
+
+
+def test_addresses() -> None:
+    assert checked_url("http://127.0.0.1:8000/") == "http://127.0.0.1:8000"
+    assert checked_url("https://[::1]:8000") == "https://[::1]:8000"
+    for text in ("", "127.0.0.1:8000", "ftp://x", "http://", "http://x/v1", "http://x:99999", "http://x?a", "http://[::"):
+        with pytest.raises(InputError, match="URL"):
+            checked_url(text)
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [{}, {"Gi-Volume": "{"}, {"Gi-Volume": "[]"}, {"shape": [6, 4, 8, 8, 3]}, {"shape": [6, 4, 8, 9, 4]}, {"shape": []}, {"Gi-Tick": "x"}],
+)
+def test_replies_that_do_not_fit_together_are_refused(headers: dict[str, Any]) -> None:
+    facts = {"shape": headers.get("shape", [6, 4, 8, 8, 4]), "scale": 1.0, "basis": "cube", "origin": [0, 0, 0]}
+    given = {} if not headers else {"Gi-Volume": json.dumps(facts), "Gi-Tick": "3"} | {k: v for k, v in headers.items() if k != "shape"}
+    with pytest.raises(StreamError):
+        read_reply(httpx.Response(200, content=bytes(6 * 4 * 8 * 8 * 4 * 2), headers=given))
