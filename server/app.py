@@ -13,6 +13,7 @@ from server import problems
 from server.dependencies import refuse_repeated_parameters
 from server.finished_replies import AnswerFromFinished
 from server.head_requests import HeadRequests
+from server.metrics import CountRequests, Metrics
 from server.routes import (
     clock,
     distant,
@@ -29,6 +30,9 @@ from server.routes import (
     volume,
     weather,
     world,
+)
+from server.routes import (
+    metrics as metrics_route,
 )
 from server.routes import settings as live_settings
 from server.service import Service
@@ -64,11 +68,13 @@ def app_of(service: Service) -> FastAPI:
         lifespan=lifespan,
     )
     app.state.service = service
+    app.state.metrics = metrics = Metrics(service)
     app.add_middleware(AnswerFromFinished, replies=service.replies)
+    app.add_middleware(CountRequests, metrics=metrics)
     app.add_middleware(HeadRequests)
     problems.install(app)
     stateless = (world, lighting, volume, distant, sectors, probes, preview)
-    for resource in (health, *stateless, clock, weather, live_settings, lights, players, player_volume, live):
+    for resource in (health, metrics_route, *stateless, clock, weather, live_settings, lights, players, player_volume, live):
         app.include_router(resource.router)
     app.router.routes.append(player_stream.route)
     app.mount("/viewer", StaticFiles(directory=VIEWER), name="viewer")

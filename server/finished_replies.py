@@ -18,6 +18,8 @@ MAX_BYTES = 64 << 20  # some 80 raw volumes
 # Longer targets are somebody's experiment; remembering them would cost more than it saves.
 MAX_TARGET_BYTES = 512
 MAX_TARGETS = 4096
+# In a scope: a reply was sent that had been made before, so the path is one that a route has, letter by letter.
+IS_FINISHED = "sectorlight.is_finished"
 
 Target = tuple[str, bytes]
 
@@ -139,4 +141,5 @@ class AnswerFromFinished:
         if reply is None:
             await self._app(scope, receive, send)
         else:
+            scope[IS_FINISHED] = True
             await reply.answer(Headers(scope=scope))(scope, receive, send)

@@ -67,6 +67,11 @@ class Live:
         return self._ticker is not None
 
     @property
+    def started_ticker(self) -> Ticker | None:
+        """The ticker, if there is one; starts none."""
+        return self._ticker
+
+    @property
     def ticker(self) -> Ticker:
         """The running ticker; starts it. Raises LiveUnavailableError once the server stops, or when it could not start."""
         with self._lock:

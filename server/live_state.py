@@ -142,8 +142,9 @@ def authored_lamps(lamps: tuple[Lamp, ...]) -> Mapping[str, LiveLamp]:
     found: dict[str, LiveLamp] = {}
     for number, lamp in enumerate(lamps):
         name = _NOT_OF_IDS.sub("-", lamp.name).strip("-")[:64]
-        if not name or name in found:
-            name = f"lamp-{number}"
+        name = name if name and name not in found else f"lamp-{number}"
+        while name in found:  # somebody named a lamp like that
+            name += "-"
         found[name] = LiveLamp(name, lamp)
     return MappingProxyType(found)
 

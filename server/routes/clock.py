@@ -30,7 +30,7 @@ def clock(ticker: TickerDep, _: Annotated[NoQuery, Query()]) -> dict[str, Any]:
 
 
 @router.put("", response_model=ClockReply, dependencies=WRITE, openapi_extra=_BODY)
-async def change_clock(service: ServiceDep, ticker: WritingTickerDep, body: JsonBody, _: Annotated[NoQuery, Query()]) -> dict[str, Any]:
+async def change_clock(body: JsonBody, service: ServiceDep, ticker: WritingTickerDep, _: Annotated[NoQuery, Query()]) -> dict[str, Any]:
     """Set time, rate or pause, all together from the tick that the reply names."""
     location = service.dataset.world.location
 

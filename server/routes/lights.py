@@ -1,6 +1,7 @@
 """The live world's lamps: those of the dataset, and those that requests add. No bake is needed for any."""
 
 import secrets
+from dataclasses import replace
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Query, Response
@@ -45,10 +46,13 @@ def lights(ticker: TickerDep, _: Annotated[NoQuery, Query()]) -> Response:
 
 @router.post("", response_model=LightReply, status_code=201, dependencies=WRITE, openapi_extra=_NEW)
 async def add_light(
-    service: ServiceDep, ticker: WritingTickerDep, body: JsonBody, response: Response, _: Annotated[NoQuery, Query()]
+    body: JsonBody, service: ServiceDep, ticker: WritingTickerDep, response: Response, _: Annotated[NoQuery, Query()]
 ) -> dict[str, Any]:
     """Another lamp."""
-    lamp = lamp_from_json(body, "light", new_id=f"light-{secrets.token_hex(4)}")
+    lamp = lamp_from_json(body, "light", new_id="new")
+    if "id" not in body:  # made up last, so that the same mistake is always refused in the same words
+        name = f"light-{secrets.token_hex(4)}"
+        lamp = replace(lamp, id=name, lamp=replace(lamp.lamp, name=name))
     if lamp.kept:
         service.live.kept.expect_possible()
     applied = await apply(ticker, lambda state, _: state.with_lamp(lamp, new=True))
@@ -66,7 +70,7 @@ def light(ticker: TickerDep, name: IdInPath, _: Annotated[NoQuery, Query()]) -> 
 
 @router.patch("/{id}", response_model=LightReply, dependencies=WRITE, openapi_extra=body_schema({"position": [42, 4, 60]}, _MEMBERS))
 async def change_light(
-    service: ServiceDep, ticker: WritingTickerDep, name: IdInPath, body: JsonBody, _: Annotated[NoQuery, Query()]
+    name: IdInPath, body: JsonBody, service: ServiceDep, ticker: WritingTickerDep, _: Annotated[NoQuery, Query()]
 ) -> dict[str, Any]:
     """Move a lamp, or change anything else of it; what the body does not name stays."""
     if body.get("keep") is True:

@@ -44,7 +44,7 @@ def players(ticker: TickerDep, _: Annotated[NoQuery, Query()]) -> Response:
 
 @router.post("", response_model=PlayerReply, status_code=201, dependencies=WRITE, openapi_extra=_BODY)
 async def add_player(
-    service: ServiceDep, ticker: WritingTickerDep, body: JsonBody, response: Response, _: Annotated[NoQuery, Query()]
+    body: JsonBody, service: ServiceDep, ticker: WritingTickerDep, response: Response, _: Annotated[NoQuery, Query()]
 ) -> dict[str, Any]:
     """Another player, at the start of its walk in the tick that the reply names."""
     kept = body.pop("keep", False)

@@ -40,7 +40,7 @@ def settings(ticker: TickerDep, _: Annotated[NoQuery, Query()]) -> dict[str, Any
 
 
 @router.put("", response_model=SettingsReply, dependencies=WRITE, openapi_extra=_BODY)
-async def change_settings(ticker: WritingTickerDep, body: JsonBody, _: Annotated[NoQuery, Query()]) -> dict[str, Any]:
+async def change_settings(body: JsonBody, ticker: WritingTickerDep, _: Annotated[NoQuery, Query()]) -> dict[str, Any]:
     """Change some settings; those that the body does not name stay."""
 
     def command(state: LiveState, tick: int) -> LiveState:

@@ -32,7 +32,7 @@ def weather(ticker: TickerDep, _: Annotated[NoQuery, Query()]) -> dict[str, Any]
 
 
 @router.put("", response_model=WeatherReply, dependencies=WRITE, openapi_extra=_BODY)
-async def change_weather(service: ServiceDep, ticker: WritingTickerDep, body: JsonBody, _: Annotated[NoQuery, Query()]) -> dict[str, Any]:
+async def change_weather(body: JsonBody, service: ServiceDep, ticker: WritingTickerDep, _: Annotated[NoQuery, Query()]) -> dict[str, Any]:
     """Another weather, at once or little by little, from the tick that the reply names."""
     after, blend_s = weather_from_json(body, service.dataset.world.location, service.live.measured)
 
