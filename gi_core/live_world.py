@@ -31,7 +31,7 @@ from gi_core.light_geometry import ShadowGeometry
 from gi_core.light_needs import WHOLLY, LightNeeds
 from gi_core.live_sector import BURST_CHANGE, BURST_PASSES, LiveLight, LiveSector
 from gi_core.live_shadows import LiveShadows
-from gi_core.live_volume import LiveVolume
+from gi_core.live_volume import LiveVolume, PublishedVolume
 from gi_core.relight import Relighter
 from gi_core.relight_input import RelightInput
 from gi_core.sector import Sector
@@ -121,6 +121,11 @@ class LiveWorld:
         """Bytes on the device: sectors, volumes, the shadow map."""
         residents = sum(sector.nbytes for sector in list(self.streamer.residents.values()))
         return residents + sum(v.nbytes for v in list(self.volumes.values())) + (self._shadows.nbytes if self._shadows else 0)
+
+    def published(self, player: str) -> PublishedVolume | None:
+        """A player's latest volume, from any thread; None before its first."""
+        volume = self.volumes.get(player)
+        return None if volume is None else volume.published
 
     def tick(
         self, tick: int, players: TickPlayers, light: LiveLight, boxes: Sequence[MovingBox] = (), fill_ms: float = np.inf

@@ -1,5 +1,8 @@
 """The HTTP application: routes, problems, the viewer page. Built by a function, so that a process can serve any dataset."""
 
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from pathlib import Path
 
 from fastapi import Depends, FastAPI
@@ -10,7 +13,28 @@ from server import problems
 from server.dependencies import refuse_repeated_parameters
 from server.finished_replies import AnswerFromFinished
 from server.head_requests import HeadRequests
-from server.routes import distant, health, lighting, preview, probes, sectors, volume, world
+from server.metrics import CountRequests, Metrics
+from server.routes import (
+    clock,
+    distant,
+    health,
+    lighting,
+    lights,
+    live,
+    player_stream,
+    player_volume,
+    players,
+    preview,
+    probes,
+    sectors,
+    volume,
+    weather,
+    world,
+)
+from server.routes import (
+    metrics as metrics_route,
+)
+from server.routes import settings as live_settings
 from server.service import Service
 from server.settings import Settings
 from server.version import program_version
@@ -24,7 +48,16 @@ def create_app(dataset_path: Path, settings: Settings) -> FastAPI:
 
 
 def app_of(service: Service) -> FastAPI:
-    """An application on top of an open service."""
+    """An application on top of an open service. Its lifespan is the live world's."""
+
+    @asynccontextmanager
+    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        await asyncio.to_thread(service.live.start_if_needed)
+        yield
+        await service.streams.close()
+        await asyncio.to_thread(service.live.close)
+        service.close()
+
     app = FastAPI(
         title="Sectorlight",
         version=program_version(),
@@ -32,13 +65,18 @@ def app_of(service: Service) -> FastAPI:
         description="Errors are `application/problem+json` with a stable `code`. World frame: metres, Y up, X east, Z south.",
         dependencies=[Depends(refuse_repeated_parameters)],
         redirect_slashes=False,
+        lifespan=lifespan,
     )
     app.state.service = service
+    app.state.metrics = metrics = Metrics(service)
     app.add_middleware(AnswerFromFinished, replies=service.replies)
+    app.add_middleware(CountRequests, metrics=metrics)
     app.add_middleware(HeadRequests)
     problems.install(app)
-    for resource in (health, world, lighting, volume, distant, sectors, probes, preview):
+    stateless = (world, lighting, volume, distant, sectors, probes, preview)
+    for resource in (health, metrics_route, *stateless, clock, weather, live_settings, lights, players, player_volume, live):
         app.include_router(resource.router)
+    app.router.routes.append(player_stream.route)
     app.mount("/viewer", StaticFiles(directory=VIEWER), name="viewer")
 
     @app.get("/", include_in_schema=False)

@@ -7,6 +7,7 @@ from fastapi import Request, Response
 
 from server.dependencies import get_service
 from server.finished_replies import Body, FinishedReply, names, target_of
+from server.server_timing import Laps
 
 __all__ = ["FILE_CACHE_CONTROL", "QUERY_CACHE_CONTROL", "Body", "conditional", "has_current", "strong_etag"]
 
@@ -30,14 +31,22 @@ def has_current(request: Request, etag: str) -> bool:
     return names(request.headers, etag)
 
 
-def conditional(request: Request, etag: str, compute: Callable[[], Body], cache_control: str = QUERY_CACHE_CONTROL) -> Response:
+def conditional(
+    request: Request, etag: str, compute: Callable[[], Body], cache_control: str = QUERY_CACHE_CONTROL, laps: Laps | None = None
+) -> Response:
     """304 when the client has the reply already, else the reply: a finished one, or what ``compute`` returns.
 
-    ``*`` in If-None-Match means any successful reply.
+    ``*`` in If-None-Match means any successful reply. A reply that is computed says what took how long: ``laps``, or all of it as one.
     """
     if has_current(request, etag):
         return Response(status_code=304, headers={"ETag": etag, "Cache-Control": cache_control})
     replies = get_service(request).replies
-    reply = replies.get(etag) or FinishedReply(etag, cache_control, compute())
+    reply, laps = replies.get(etag), laps or Laps()
+    is_new = reply is None
+    if reply is None:
+        replies.count_miss()
+        with laps.unless_divided("compute"):
+            reply = FinishedReply(etag, cache_control, compute())
     replies.keep(target_of(request.scope), reply)
-    return reply.answer(request.headers)
+    answer = reply.answer(request.headers)
+    return laps.told(answer) if is_new and answer.status_code == 200 else answer

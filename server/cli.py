@@ -14,6 +14,8 @@ import typer
 
 from gi_core.errors import FormatError, InputError, SectorlightError, SectorMissingError
 from server.cli_loadtest import loadtest
+from server.cli_options import DeviceOption
+from server.cli_serve_options import serve
 from server.version import program_version
 
 INTERRUPTED = 130  # 128 + SIGINT, what a shell expects
@@ -29,7 +31,6 @@ app = typer.Typer(
 )
 
 SectorRange = tuple[tuple[int, int], tuple[int, int]]
-DeviceOption = Annotated[str | None, typer.Option(envvar="SECTORLIGHT_DEVICE", help="Part of an OpenCL device's name.")]
 
 
 def main() -> None:
@@ -137,23 +138,7 @@ def info(
         show_sector(dataset, sector)
 
 
-@app.command()
-def serve(
-    dataset: Annotated[Path, typer.Argument(help="A baked dataset's folder.")],
-    host: Annotated[
-        str, typer.Option(envvar="SECTORLIGHT_HOST", help="Address to listen on; beyond loopback needs --token-file.")
-    ] = "127.0.0.1",
-    port: Annotated[int, typer.Option(envvar="SECTORLIGHT_PORT", min=0, max=65535, help="0 takes a free one.")] = 8000,
-    device: DeviceOption = None,
-    token_file: Annotated[Path | None, typer.Option(envvar="SECTORLIGHT_TOKEN_FILE", help="File with the bearer token of writes.")] = None,
-) -> None:
-    """Serve a dataset over HTTP."""
-    from server.cli_serve import run
-    from server.settings import Settings
-
-    run(dataset, Settings(host=host, port=port, device=device, token_file=token_file))
-
-
+app.command()(serve)
 app.command()(loadtest)
 
 

@@ -7,12 +7,14 @@ import math
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from fastapi import Depends, Request
+from fastapi import Depends
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
+from starlette.requests import HTTPConnection
 
 from gi_core.arrays import Float64
 from gi_core.errors import InputError
+from gi_core.json_fields import LARGEST_INTEGER
 from server.encoding import ArrayFormat, RawEncoding
 from server.service import Service
 
@@ -60,13 +62,20 @@ class PositionQuery(LightingQuery):
         return np.array([self.x, self.y, self.z], np.float64)
 
 
-class VolumeQuery(PositionQuery):
-    kind: Literal["outdoor"] = "outdoor"
-    basis: Literal["cube"] = "cube"
-    cascade: int = Field(0, ge=0, le=0, description="0: 32 x 16 x 32 voxels of 3.125 m")
+class VolumeFormatQuery(StrictQuery):
     format: ArrayFormat = "npy"
     encoding: RawEncoding = Field("f16", description="of format=raw: RGBA half floats; lux = rgb x scale; alpha = 1 in free air, else 0")
     mask: bool = Field(False, description="1: the voxels' classes (uint8) instead of light")
+
+
+class VolumeQuery(PositionQuery, VolumeFormatQuery):
+    kind: Literal["outdoor"] = "outdoor"
+    basis: Literal["cube"] = "cube"
+    cascade: int = Field(0, ge=0, le=0, description="0: 32 x 16 x 32 voxels of 3.125 m")
+
+
+class PlayerVolumeQuery(VolumeFormatQuery):
+    since: int | None = Field(None, ge=-1, le=LARGEST_INTEGER, description="the tick that the client has: 304 when there is no later one")
 
 
 class DistantQuery(LightingQuery):
@@ -115,7 +124,7 @@ class NoQuery(StrictQuery):
     """For routes that take no parameters."""
 
 
-def refuse_repeated_parameters(request: Request) -> None:
+def refuse_repeated_parameters(request: HTTPConnection) -> None:
     """InputError when a parameter is given twice: either value may be the one that was meant."""
     names = [name for name, _ in request.query_params.multi_items()]
     repeated = sorted({name for name in names if names.count(name) > 1})
@@ -123,7 +132,7 @@ def refuse_repeated_parameters(request: Request) -> None:
         raise InputError(f"query: expected each parameter once, found {repeated[0][:40]} more than once")
 
 
-def get_service(request: Request) -> Service:
+def get_service(request: HTTPConnection) -> Service:
     """The running server's service."""
     service = request.app.state.service
     assert isinstance(service, Service)

@@ -18,6 +18,8 @@ MAX_BYTES = 64 << 20  # some 80 raw volumes
 # Longer targets are somebody's experiment; remembering them would cost more than it saves.
 MAX_TARGET_BYTES = 512
 MAX_TARGETS = 4096
+# In a scope: a reply was sent that had been made before, so the path is one that a route has, letter by letter.
+IS_FINISHED = "sectorlight.is_finished"
 
 Target = tuple[str, bytes]
 
@@ -63,6 +65,7 @@ class FinishedReplies:
     """The replies that were asked for last, bounded in bytes. Safe to use from several threads."""
 
     def __init__(self, max_bytes: int = MAX_BYTES) -> None:
+        self.hits = self.misses = 0
         self._max_bytes = max_bytes
         self._bytes = 0
         self._replies: OrderedDict[str, FinishedReply] = OrderedDict()
@@ -75,7 +78,18 @@ class FinishedReplies:
             found = None if etag is None else self._replies.get(etag)
             if found is not None:
                 self._replies.move_to_end(found.etag)
+                self.hits += 1
             return found
+
+    def count_miss(self) -> None:
+        """A reply had to be computed."""
+        with self._lock:
+            self.misses += 1
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the replies that are kept."""
+        return self._bytes
 
     def at(self, target: Target) -> FinishedReply | None:
         """The reply to a path and query that were asked for before, if it is still kept."""
@@ -127,4 +141,5 @@ class AnswerFromFinished:
         if reply is None:
             await self._app(scope, receive, send)
         else:
+            scope[IS_FINISHED] = True
             await reply.answer(Headers(scope=scope))(scope, receive, send)

@@ -1,8 +1,9 @@
 """Live edits that asked to be kept: players and lamps in a JSON file, written whole after each change, read at the next start."""
 
 import json
+import os
 import threading
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,6 +30,9 @@ class KeptEdits:
     """Writes the state file. Safe to use from several threads."""
 
     def __init__(self, path: Path | None) -> None:
+        """Raises InputError when nothing could be written there, rather than at the first edit."""
+        if path is not None and (path.is_dir() or not os.access(path.parent, os.W_OK)):
+            raise InputError(f"--state {path}: expected a file in a folder that exists and can be written to")
         self._path = path
         self._lock = threading.Lock()
 
@@ -37,15 +41,16 @@ class KeptEdits:
         if self._path is None:
             raise InputError("keep: expected a server that was started with --state FILE, found none; leave keep out")
 
-    def save(self, state: LiveState) -> None:
-        """Write what of a state is to be kept, whole or not at all. Nothing without a file. Raises OSError."""
+    def save(self, latest: Callable[[], LiveState]) -> None:
+        """Write what of the latest state is to be kept, whole or not at all. Nothing without a file. Raises OSError."""
         if self._path is None:
             return
-        record = {
-            "players": [entry.player.to_json() for entry in state.players.values() if entry.kept],
-            "lights": [lamp_to_json(lamp) for lamp in state.lamps.values() if lamp.kept],
-        }
-        with self._lock:
+        with self._lock:  # asked for inside: of two that save, the one who waited must not write what was before the other's
+            state = latest()
+            record = {
+                "players": [entry.player.to_json() for entry in state.players.values() if entry.kept],
+                "lights": [lamp_to_json(lamp) for lamp in state.lamps.values() if lamp.kept],
+            }
             write_atomic(self._path, (json.dumps(record, indent=1, allow_nan=False) + "\n").encode())
 
 

@@ -13,7 +13,7 @@ from gi_core.dataset import Dataset
 from gi_core.epw_weather import EpwWeather
 from gi_core.live_world import DEFAULT_BUDGET_BYTES, LiveWorld
 from server.kept_edits import KeptEdits, load_kept
-from server.live_state import LivePlayer, LiveState, LiveUnavailableError, authored_lamps
+from server.live_state import LivePlayer, LiveState, LiveUnavailableError, NotKeptError, authored_lamps
 from server.live_weather import fixed_weather
 from server.players import Player, read_players
 from server.street_lattice import StreetLattice
@@ -67,6 +67,11 @@ class Live:
         return self._ticker is not None
 
     @property
+    def started_ticker(self) -> Ticker | None:
+        """The ticker, if there is one; starts none."""
+        return self._ticker
+
+    @property
     def ticker(self) -> Ticker:
         """The running ticker; starts it. Raises LiveUnavailableError once the server stops, or when it could not start."""
         with self._lock:
@@ -83,6 +88,14 @@ class Live:
         """Start at once when somebody walks from the start."""
         if self._state.players:
             self.ticker  # noqa: B018
+
+    def keep(self) -> None:
+        """Write down what is to be kept, as it is now. Not for the event loop. Raises NotKeptError."""
+        ticker = self.ticker
+        try:
+            self.kept.save(lambda: ticker.state)
+        except OSError as error:
+            raise NotKeptError(f"the change has taken effect, but could not be kept: {error.strerror or error}") from error
 
     def walking(self, player: Player, since_tick: int, kept: bool) -> LivePlayer:
         """A player on its walk. Reads sectors for a walk along streets: not for the event loop. Raises InputError."""

@@ -4,6 +4,7 @@ Requests don't change the world: they hand in commands, which the ticker applies
 and a command either takes effect whole, from the tick that its reply names, or not at all.
 """
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
@@ -19,6 +20,7 @@ from server.players import MAX_PLAYERS, Player
 from server.world_clock import WorldClock
 
 MAX_LAMPS = 20_000
+_NOT_OF_IDS = re.compile(r"[^A-Za-z0-9_-]+")
 
 
 class NoSuchThingError(InputError, LookupError):
@@ -37,6 +39,12 @@ class LiveUnavailableError(SectorlightError, RuntimeError):
     """The live world cannot answer now: HTTP 503."""
 
     code = "live_unavailable"
+
+
+class NotKeptError(SectorlightError, RuntimeError):
+    """A change that took effect but could not be written to the state file: HTTP 507."""
+
+    code = "not_kept"
 
 
 @dataclass(frozen=True)
@@ -100,6 +108,18 @@ class LiveState:
         """One lamp less. Raises NoSuchThingError."""
         return replace(self, lamps=_without(self.lamps, name, "light"))
 
+    def with_clock(self, clock: WorldClock, is_jump: bool) -> "LiveState":
+        """Another clock."""
+        return replace(self, clock=clock, jumps=self.jumps + is_jump)
+
+    def with_weather(self, weather: WeatherSource, is_jump: bool) -> "LiveState":
+        """Another weather."""
+        return replace(self, weather=weather, jumps=self.jumps + is_jump)
+
+    def with_settings(self, settings: Settings) -> "LiveState":
+        """Other settings, which light follows at once."""
+        return replace(self, settings=settings, jumps=self.jumps + 1)
+
     def lamp(self, name: str) -> LiveLamp:
         """A lamp by its id. Raises NoSuchThingError."""
         if name not in self.lamps:
@@ -118,10 +138,13 @@ Command = Callable[[LiveState, int], LiveState]
 
 
 def authored_lamps(lamps: tuple[Lamp, ...]) -> Mapping[str, LiveLamp]:
-    """The dataset's lamps under ids: their names where those are there and distinct, else their numbers."""
+    """The dataset's lamps under ids: their names as far as ids have such letters, where those are distinct, else their numbers."""
     found: dict[str, LiveLamp] = {}
     for number, lamp in enumerate(lamps):
-        name = lamp.name if lamp.name and lamp.name not in found else f"lamp-{number}"
+        name = _NOT_OF_IDS.sub("-", lamp.name).strip("-")[:64]
+        name = name if name and name not in found else f"lamp-{number}"
+        while name in found:  # somebody named a lamp like that
+            name += "-"
         found[name] = LiveLamp(name, lamp)
     return MappingProxyType(found)
 

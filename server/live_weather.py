@@ -21,10 +21,12 @@ class WeatherSource:
     """A weather for every moment.
 
     at : from an aware moment to its weather; description : what PUT /v1/weather takes to get it again
+    is_blend : whether it turned out of another one
     """
 
     at: Callable[[datetime], Weather]
     description: dict[str, Any]
+    is_blend: bool = False
 
 
 def fixed_weather(text: str) -> WeatherSource:
@@ -71,6 +73,10 @@ def blended(before: WeatherSource, after: WeatherSource, since: datetime, blend_
     """``after``, but within ``blend_s`` of the world's time from ``since`` on, in between: continuous in every number."""
     if blend_s <= 0:
         return after
+    if before.is_blend:
+        # From where that one has got to: else each blend would hold all those before it, and ask them.
+        reached = before.at(since)
+        before = WeatherSource(lambda _: reached, {})
 
     def at(moment: datetime) -> Weather:
         share = (moment - since).total_seconds() / blend_s
@@ -81,4 +87,4 @@ def blended(before: WeatherSource, after: WeatherSource, since: datetime, blend_
         first, second = before.at(moment), after.at(moment)
         return weather_of({name: between(getattr(first, name), getattr(second, name), share) for name in WEATHER_RANGES})
 
-    return WeatherSource(at, after.description)
+    return WeatherSource(at, after.description, is_blend=True)

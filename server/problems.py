@@ -17,31 +17,31 @@ from gi_core.errors import (
     SectorlightError,
     SectorMissingError,
 )
+from server.http_errors import BodyTooLargeError, NotJsonError, RangeError, TokenError
+from server.live_state import LiveUnavailableError, NoSuchThingError, NotKeptError, TakenIdError
 
 log = logging.getLogger("sectorlight.http")
 
 # First match wins, so a class stands above its bases.
 STATUS_OF: tuple[tuple[type[Exception], HTTPStatus], ...] = (
     (OutsideWorldError, HTTPStatus.NOT_FOUND),
+    (NoSuchThingError, HTTPStatus.NOT_FOUND),
+    (TakenIdError, HTTPStatus.CONFLICT),
+    (TokenError, HTTPStatus.UNAUTHORIZED),
+    (BodyTooLargeError, HTTPStatus.REQUEST_ENTITY_TOO_LARGE),
+    (NotJsonError, HTTPStatus.UNSUPPORTED_MEDIA_TYPE),
     (InputError, HTTPStatus.BAD_REQUEST),
     (SectorMissingError, HTTPStatus.NOT_FOUND),
     (FormatError, HTTPStatus.SERVICE_UNAVAILABLE),
+    (LiveUnavailableError, HTTPStatus.SERVICE_UNAVAILABLE),
+    (NotKeptError, HTTPStatus.INSUFFICIENT_STORAGE),
     (SectorlightError, HTTPStatus.INTERNAL_SERVER_ERROR),
 )
 
+RETRY_AFTER_S = 1  # kernels that were built before are warm within seconds
 LONGEST_ECHO = 80  # of what a client sent, in a reply or a log
 
 CODE_OF_STATUS = {400: "bad_request", 404: "no_such_path", 405: "method_not_allowed", 416: "range_not_satisfiable"}
-
-
-class RangeError(InputError):
-    """A byte range that lies beyond the file: HTTP 416."""
-
-    code = "range_not_satisfiable"
-
-    def __init__(self, message: str, size: int) -> None:
-        super().__init__(message)
-        self.size = size
 
 
 def problem(status: int, code: str, detail: str, headers: Mapping[str, str] | None = None, **members: Any) -> JSONResponse:
@@ -63,11 +63,13 @@ def install(app: FastAPI) -> None:
 def _own_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, SectorlightError)
     status = next(status for kind, status in STATUS_OF if isinstance(error, kind))
-    if status >= 500:
+    waiting = isinstance(error, LiveUnavailableError)
+    if status >= 500 and not waiting:
         log.error("%s: %s", request.url.path, error)
     # FileNotFoundError and LookupError quote their argument in str(): the text itself is args[0].
     text = str(error.args[0]) if error.args else error.code
-    return problem(status, error.code, text if status < 500 else request.app.state.service.public(text))
+    headers = {"Retry-After": str(RETRY_AFTER_S)} if waiting else {"WWW-Authenticate": "Bearer"} if status == 401 else None
+    return problem(status, error.code, text if status < 500 else request.app.state.service.public(text), headers)
 
 
 def _range_error(_: Request, error: Exception) -> JSONResponse:

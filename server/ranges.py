@@ -4,7 +4,7 @@ import re
 
 from fastapi import Request, Response
 
-from server.problems import RangeError
+from server.http_errors import RangeError
 
 _SINGLE_RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})$")
 

@@ -1,9 +1,11 @@
 """What routes work with: one dataset, one engine, and the limits that keep the work bounded."""
 
 import logging
+import secrets
 import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 from gi_core.dataset import Dataset
@@ -11,8 +13,12 @@ from gi_core.engine import Engine
 from gi_core.grid import SectorIndex
 from gi_core.lighting import Lighting
 from server.finished_replies import FinishedReplies
+from server.live import Live
+from server.player_streams import PlayerStreams
+from server.player_volumes import PlayerVolumes
 from server.preview_scene import PreviewScenes
-from server.settings import Settings
+from server.settings import Settings, read_token
+from server.tick_signal import TickSignal
 
 log = logging.getLogger("sectorlight.service")
 
@@ -21,13 +27,19 @@ class Service:
     """Shared by all requests of a process.
 
     Routes run on a pool of threads. The engine lights for one of them at a time, and pictures, the only other heavy work, take turns.
-    Waiting threads hold no arrays, so memory does not grow with the queue.
+    Waiting threads hold no arrays, so memory does not grow with the queue. The live world has a thread and a queue of its own.
     """
 
     def __init__(self, dataset: Dataset, engine: Engine, settings: Settings) -> None:
         self.dataset = dataset
         self.engine = engine
         self.settings = settings
+        self.token = None if settings.token_file is None else read_token(settings.token_file)
+        self.live = Live(dataset, replace(settings.live, device=settings.device))
+        self.run_id = secrets.token_hex(8)
+        self.ticks = TickSignal()
+        self.streams = PlayerStreams(self.ticks)
+        self.player_volumes = PlayerVolumes()
         self.replies = FinishedReplies()
         self.preview_scenes = PreviewScenes(dataset)
         self._preview_lock = threading.Lock()
@@ -40,6 +52,10 @@ class Service:
         """Open a dataset and a device; InputError, FormatError or KernelBuildError when either cannot be used."""
         dataset = Dataset.open(dataset_path)
         return cls(dataset, Engine(dataset, settings.device), settings)
+
+    def close(self) -> None:
+        """Stop the threads that encode."""
+        self.streams.stop_encoding()
 
     @contextmanager
     def preview_turn(self) -> Iterator[None]:
@@ -55,6 +71,12 @@ class Service:
     def light_identity(self) -> str:
         """What decides the bits of served light beside the query: the dataset, and the device, whose sums may round differently."""
         return f"{self.dataset.digest} {self.engine.device_name}"
+
+    @property
+    def expected_error(self) -> float | None:
+        """Median relative error that the dataset's error report gives; None without a report."""
+        report = self.dataset.world.error_report
+        return None if report is None else report.get("expected_error")
 
     @property
     def failed_sectors(self) -> dict[SectorIndex, str]:

@@ -1,10 +1,11 @@
 """What the operator decides about a server. The command line and ``SECTORLIGHT_*`` variables fill it; nothing else reads them."""
 
 import ipaddress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from gi_core.errors import InputError
+from server.live import LiveOptions
 
 MIN_TOKEN_LENGTH = 16  # shorter ones can be guessed over a network
 
@@ -16,12 +17,14 @@ class Settings:
     host, port : where to listen; beyond loopback only with a token file
     device : part of an OpenCL device's name, or None for the engine's choice
     token_file : file whose stripped text is the bearer token of writes
+    live : of the live world; its device is this one's
     """
 
     host: str = "127.0.0.1"
     port: int = 8000
     device: str | None = None
     token_file: Path | None = None
+    live: LiveOptions = field(default_factory=LiveOptions)
 
     def checked(self) -> "Settings":
         """Itself, or InputError when a server must not start like this."""

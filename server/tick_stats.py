@@ -1,5 +1,6 @@
 """How the ticks went: percentiles of the last minute, and counts since the start."""
 
+from bisect import bisect_left
 from collections import deque
 from dataclasses import dataclass, field
 
@@ -8,6 +9,8 @@ import numpy as np
 from gi_core.live_world import TickReport
 
 WINDOW = 1800  # a minute at 30 Hz
+# Upper ends of a histogram's buckets [s]: from a tick that does nothing to one that takes all of the slowest rate's time.
+BUCKETS_S = (0.0005, 0.001, 0.002, 0.004, 0.008, 0.016, 0.033, 0.066, 0.25, 1.0)
 
 
 @dataclass(eq=False)
@@ -16,6 +19,8 @@ class TickStats:
 
     late_ticks : ended after the next was due; skipped : ticks whose time had passed before they could begin
     misses : sectors that volumes read and that were not there, summed over ticks
+    bucket_counts : ticks that took no longer than each of BUCKETS_S and longer than the one before; the last: longer than all
+    seconds : that all ticks took together
     """
 
     ticks: int = 0
@@ -32,6 +37,8 @@ class TickStats:
     recent_lateness_ms: deque[float] = field(default_factory=lambda: deque(maxlen=WINDOW))
     parts_ms: dict[str, deque[float]] = field(default_factory=dict)
     waiting: int = 0
+    bucket_counts: list[int] = field(default_factory=lambda: [0] * (len(BUCKETS_S) + 1))
+    seconds: float = 0.0
 
     def add(self, report: TickReport, took_ms: float, lateness_ms: float, period_ms: float) -> None:
         """Count a tick that began ``lateness_ms`` after it was due and took ``took_ms``."""
@@ -44,6 +51,8 @@ class TickStats:
         self.loads += len(report.loaded)
         self.evictions += len(report.evicted)
         self.waiting = report.waiting
+        self.bucket_counts[bisect_left(BUCKETS_S, took_ms / 1e3)] += 1
+        self.seconds += took_ms / 1e3
         self.recent_ms.append(took_ms)
         self.recent_lateness_ms.append(lateness_ms)
         for name, value in report.ms.items():

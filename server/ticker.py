@@ -72,6 +72,11 @@ class Ticker:
         """Whether ticks are being made: not before the kernels are warm."""
         return self._running.is_set() and not self._stop.is_set()
 
+    @property
+    def is_stopped(self) -> bool:
+        """Whether there will be no tick any more."""
+        return self._stop.is_set()
+
     def start(self) -> None:
         """Begin; returns at once."""
         self._thread.start()
@@ -159,6 +164,8 @@ class Ticker:
                 command, done = self._commands.get_nowait()
             except queue.Empty:
                 return
+            if not done.set_running_or_notify_cancel():
+                continue  # whoever asked has gone, and a future that was cancelled takes no answer
             before = self.state
             try:
                 self.state = command(before, number)
@@ -172,13 +179,10 @@ class Ticker:
         if after.weather is not before.weather:
             self._track.set_weather(after.weather.at)
         if after.lamps is not before.lamps:
-            changed = [
-                lamp.lamp
-                for name in before.lamps.keys() | after.lamps.keys()
-                for lamp in {before.lamps.get(name), after.lamps.get(name)} - {None}
-                if lamp is not None and before.lamps.get(name) != after.lamps.get(name)
-            ]
-            self.world.lamps_moved([(np.array(lamp.position), lamp.range_m) for lamp in changed])
+            # By identity first: one lamp moves, and thousands do not.
+            pairs = [(before.lamps.get(name), after.lamps.get(name)) for name in before.lamps.keys() | after.lamps.keys()]
+            moved = [entry.lamp for pair in pairs if pair[0] is not pair[1] and pair[0] != pair[1] for entry in pair if entry is not None]
+            self.world.lamps_moved([(np.array(lamp.position), lamp.range_m) for lamp in moved])
 
     def _lighting_at(self, number: int) -> Lighting:
         clock = self.state.clock
@@ -223,6 +227,8 @@ class Ticker:
                 _, done = self._commands.get_nowait()
             except queue.Empty:
                 return
+            if not done.set_running_or_notify_cancel():
+                continue
             done.set_exception(LiveUnavailableError(f"the live world has stopped{': ' + self.failure if self.failure else ''}"))
 
 

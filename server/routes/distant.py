@@ -9,6 +9,7 @@ from gi_core.engine import Distant
 from server.caching import Body, conditional, strong_etag
 from server.dependencies import DistantQuery, ServiceDep
 from server.encoding import MEDIA_TYPE, REPLY_VERSION, half_scale, half_texels, header_json, npy
+from server.server_timing import Laps
 
 router = APIRouter(prefix="/v1", tags=["light"])
 
@@ -20,13 +21,18 @@ def distant(request: Request, service: ServiceDep, query: Annotated[DistantQuery
     Rows go south (+Z), columns east (+X). `raw`: little-endian halves (rows, cols, 6, 4); lux = rgb x scale; alpha is 0 where no
     sector was baked. `Gi-Distant` has the origin.
     """
-    light = service.lighting(query.time, query.weather)
+    laps = Laps()
+    with laps.lap("light"):
+        light = service.lighting(query.time, query.weather)
     etag = strong_etag("distant", REPLY_VERSION, service.dataset.digest, light.digest, query.format, query.encoding)
 
     def compute() -> Body:
-        return distant_body(service.engine.distant(light), query)
+        with laps.lap("relight"):
+            found = service.engine.distant(light)
+        with laps.lap("encode"):
+            return distant_body(found, query)
 
-    return conditional(request, etag, compute)
+    return conditional(request, etag, compute, laps=laps)
 
 
 def distant_body(found: Distant, query: DistantQuery) -> Body:

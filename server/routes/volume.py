@@ -8,8 +8,9 @@ from fastapi import APIRouter, Query, Request, Response
 from gi_core.constants import VOXEL_INDOORS, VOXEL_OUTDOORS
 from gi_core.volume import Volume
 from server.caching import Body, conditional, strong_etag
-from server.dependencies import ServiceDep, VolumeQuery
+from server.dependencies import ServiceDep, VolumeFormatQuery, VolumeQuery
 from server.encoding import MEDIA_TYPE, REPLY_VERSION, half_scale, half_texels, header_json, npy
+from server.server_timing import Laps
 
 router = APIRouter(prefix="/v1", tags=["light"])
 
@@ -22,17 +23,21 @@ def volume(request: Request, service: ServiceDep, query: Annotated[VolumeQuery, 
     `raw`: little-endian halves (6, 16, 32, 32, 4); lux = rgb x scale; alpha is 1 in free air, else 0.
     `mask=1`: uint8 (16, 32, 32), 0 solid, 1 outdoors, 2 indoors, 3 no sector there. The header `Gi-Volume` places it in the world.
     """
-    light = service.lighting(query.time, query.weather)
+    laps = Laps()
+    with laps.lap("light"):
+        light = service.lighting(query.time, query.weather)
     etag = strong_etag("volume", REPLY_VERSION, service.light_identity, light.digest, query.model_dump(exclude={"time", "weather"}))
 
     def compute() -> Body:
-        found = service.engine.volume(query.position, light)
-        return mask_body(found, query) if query.mask else light_body(found, query)
+        with laps.lap("relight"):
+            found = service.engine.volume(query.position, light)
+        with laps.lap("encode"):
+            return mask_body(found, query) if query.mask else light_body(found, query)
 
-    return conditional(request, etag, compute)
+    return conditional(request, etag, compute, laps=laps)
 
 
-def light_body(found: Volume, query: VolumeQuery) -> Body:
+def light_body(found: Volume, query: VolumeFormatQuery) -> Body:
     """The light of a volume in the format that was asked for."""
     values = found.values
     if query.format == "npy":
@@ -43,7 +48,7 @@ def light_body(found: Volume, query: VolumeQuery) -> Body:
     return _body(texels, query, volume_facts(found, (*values.shape[:-1], 4), "float16", scale))
 
 
-def mask_body(found: Volume, query: VolumeQuery) -> Body:
+def mask_body(found: Volume, query: VolumeFormatQuery) -> Body:
     """The classes of a volume's voxels."""
     content = npy(found.mask) if query.format == "npy" else found.mask.tobytes()
     return _body(content, query, volume_facts(found, found.mask.shape, "uint8", 1.0))
@@ -65,5 +70,5 @@ def volume_facts(found: Volume, shape: tuple[int, ...], dtype: str, scale: float
     }
 
 
-def _body(content: bytes, query: VolumeQuery, facts: Mapping[str, Any]) -> Body:
+def _body(content: bytes, query: VolumeFormatQuery, facts: Mapping[str, Any]) -> Body:
     return Body(content, MEDIA_TYPE[query.format], {"Gi-Volume": header_json(facts)})

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import secrets
 import socket
 import sys
 import threading
@@ -14,15 +15,18 @@ from typing import Any
 
 import httpx
 import pytest
-import uvicorn
 from fastapi import FastAPI
 
+from gi_core.constants import VOXEL_SIZE_M
 from server.app import create_app
 from server.cli import main
+from server.cli_serve import http_server
+from server.live import LiveOptions
 from server.settings import Settings
 
 SOURCE = "procedural:midtown?blocks=1x1&seed=1"
-STARTUP_S = 60.0  # a fresh process builds its kernels, on a machine that may be busy
+LIVE_RATE_HZ = 20
+STARTUP_S = 90.0  # a fresh process builds its kernels, on a machine that may be busy
 
 Serving = Callable[[FastAPI], AbstractContextManager[httpx.Client]]
 
@@ -40,7 +44,7 @@ def city(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @contextlib.contextmanager
 def _serving(app: FastAPI) -> Iterator[httpx.Client]:
     listener = socket.create_server(("127.0.0.1", 0))
-    server = uvicorn.Server(uvicorn.Config(app, log_level="critical"))
+    server = http_server(app, "critical")
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
     thread.start()
     try:
@@ -73,6 +77,55 @@ def http(app: FastAPI) -> Iterator[httpx.Client]:
     """A client of a server of the tiny city."""
     with _serving(app) as client:
         yield client
+
+
+@pytest.fixture(scope="session")
+def live_app(city: Path, tmp_path_factory: pytest.TempPathFactory) -> FastAPI:
+    """An application whose live world tests share: each uses players and lights of its own, and sets the clock that it needs."""
+    state = tmp_path_factory.mktemp("live") / "kept.json"
+    return create_app(city, Settings(live=LiveOptions(ticks_per_second=LIVE_RATE_HZ, state_file=state)))
+
+
+@pytest.fixture(scope="session")
+def live_http(live_app: FastAPI) -> Iterator[httpx.Client]:
+    """A client of a server whose live world ticks."""
+    with _serving(live_app) as client:
+        _wait_until_live(client)
+        yield client
+
+
+def _wait_until_live(client: httpx.Client) -> None:
+    deadline = time.monotonic() + STARTUP_S
+    while (reply := client.get("/v1/live")).status_code == 503:
+        assert time.monotonic() < deadline, reply.text
+        time.sleep(0.05)
+    assert reply.status_code == 200, reply.text
+
+
+@pytest.fixture(scope="session")
+def wait_until_live() -> Callable[[httpx.Client], None]:
+    """Starts a server's live world, and returns once it ticks."""
+    return _wait_until_live
+
+
+@pytest.fixture(scope="session")
+def street(live_app: FastAPI) -> tuple[float, float, float]:
+    """Somewhere in the tiny city's streets where one can stand."""
+    live = live_app.state.service.live
+    columns = [c for index in live.dataset.world.sectors for c in live.lattice.columns_of(index)]
+    x, z = columns[len(columns) // 2]
+    level = live.lattice.level(x, z)
+    assert level is not None
+    return (x + 0.5) * VOXEL_SIZE_M, (level + 0.5) * VOXEL_SIZE_M, (z + 0.5) * VOXEL_SIZE_M
+
+
+@pytest.fixture
+def player(live_http: httpx.Client, street: tuple[float, float, float]) -> Iterator[str]:
+    """The id of a player who stands in the street while a test lasts."""
+    name = f"standing-{secrets.token_hex(4)}"
+    assert live_http.post("/v1/players", json={"id": name, "path": [street], "speed": 0}).status_code == 201
+    yield name
+    live_http.delete(f"/v1/players/{name}")
 
 
 @pytest.fixture(scope="session")

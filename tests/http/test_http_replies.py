@@ -174,3 +174,20 @@ def test_head_is_get_without_the_body(http: httpx.Client, moment: dict[str, Any]
         assert (head.status_code, head.content) == (whole.status_code, b"")
         for name in ("content-length", "content-type", "etag", "gi-volume"):
             assert head.headers.get(name) == whole.headers.get(name)
+
+
+def test_every_route_is_described(http: httpx.Client) -> None:
+    """/docs is how most users meet the live world's bodies, which are read by hand."""
+    description = http.get("/openapi.json").json()
+    for path, methods in description["paths"].items():
+        for method, operation in methods.items():
+            assert operation.get("description"), f"{method} {path}"
+            if method in ("put", "patch", "post"):
+                body = operation["requestBody"]["content"]["application/json"]
+                assert set(body["example"]) <= set(body["schema"]["properties"])
+                assert all(member["description"] for member in body["schema"]["properties"].values())
+            if method in ("put", "patch", "post", "delete"):
+                assert operation["security"], f"{method} {path}"
+    assert {"/v1/clock", "/v1/weather", "/v1/settings", "/v1/lights/{id}", "/v1/players/{id}/volume", "/v1/live"} <= set(
+        description["paths"]
+    )

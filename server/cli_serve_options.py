@@ -1,0 +1,60 @@
+"""The options of ``sectorlight serve``. What they do is imported when it runs."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from server.cli_options import DeviceOption
+
+
+def serve(
+    dataset: Annotated[Path, typer.Argument(help="A baked dataset's folder.")],
+    host: Annotated[
+        str, typer.Option(envvar="SECTORLIGHT_HOST", help="Address to listen on; beyond loopback needs --token-file.")
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option(envvar="SECTORLIGHT_PORT", min=0, max=65535, help="0 takes a free one.")] = 8000,
+    device: DeviceOption = None,
+    token_file: Annotated[Path | None, typer.Option(envvar="SECTORLIGHT_TOKEN_FILE", help="File with the bearer token of writes.")] = None,
+    players: Annotated[
+        Path | None,
+        typer.Option(
+            envvar="SECTORLIGHT_PLAYERS", metavar="FILE", help="Who walks from the start, .json or .toml; starts the live world at once."
+        ),
+    ] = None,
+    state: Annotated[
+        Path | None,
+        typer.Option(envvar="SECTORLIGHT_STATE", metavar="FILE", help="Where players and lights that ask to be kept are kept."),
+    ] = None,
+    epw: Annotated[
+        Path | None, typer.Option(envvar="SECTORLIGHT_EPW", metavar="FILE", help="A measured year's weather, for PUT /v1/weather.")
+    ] = None,
+    tick_rate: Annotated[
+        int, typer.Option(envvar="SECTORLIGHT_TICK_RATE", min=1, max=240, help="Of the live world, in Hz: more is smoother and costs more.")
+    ] = 30,
+    time: Annotated[
+        str, typer.Option(envvar="SECTORLIGHT_TIME", help="Where the live world's clock starts: 13:00, or ISO 8601 with a date.")
+    ] = "12:00",
+    weather: Annotated[
+        str, typer.Option(envvar="SECTORLIGHT_WEATHER", help="The live world's at the start: a preset, or one with overrides.")
+    ] = "clear",
+    budget_mb: Annotated[
+        int,
+        typer.Option(envvar="SECTORLIGHT_BUDGET_MB", min=16, max=1 << 20, help="Memory of the live world's sectors; never exceeded."),
+    ] = 384,
+) -> None:
+    """Serve a dataset over HTTP: its light at any hour and weather, and a live world with a clock, lights and players."""
+    from server.cli_serve import run
+    from server.live import LiveOptions
+    from server.settings import Settings
+
+    live = LiveOptions(
+        ticks_per_second=tick_rate,
+        start_time=time,
+        start_weather=weather,
+        budget_bytes=budget_mb << 20,
+        players_file=players,
+        state_file=state,
+        epw_file=epw,
+    )
+    run(dataset, Settings(host=host, port=port, device=device, token_file=token_file, live=live))

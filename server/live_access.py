@@ -1,0 +1,77 @@
+"""How routes get at the live world: the first of them starts it. Reads are told to come back while it warms up, writes wait.
+
+A world that was built before is warm in a second or two; kernels that are new to a machine take half a minute.
+"""
+
+import asyncio
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+from fastapi import Depends
+
+from server.dependencies import ServiceDep
+from server.live_state import Command, LiveState, LiveUnavailableError
+from server.service import Service
+from server.ticker import Ticker
+
+WRITES_WAIT_S = 25.0
+_LOOK_AGAIN_S = 0.02
+
+
+async def running_ticker(service: Service, wait_s: float) -> Ticker:
+    """The ticker, once it ticks. Raises LiveUnavailableError when it does not within some seconds, or never will."""
+    live = service.live
+    # Making the world opens a device, which takes a while.
+    ticker = live.ticker if live.is_started else await asyncio.to_thread(lambda: live.ticker)
+    give_up_at = asyncio.get_running_loop().time() + wait_s
+    while not ticker.is_running:
+        if ticker.is_stopped:
+            raise LiveUnavailableError(f"the live world cannot run: {ticker.failure or 'the server is stopping'}")
+        if asyncio.get_running_loop().time() >= give_up_at:
+            raise LiveUnavailableError("the live world is starting; ask again in a moment")
+        await asyncio.sleep(_LOOK_AGAIN_S)
+    service.ticks.follow(ticker)
+    return ticker
+
+
+async def _for_reading(service: ServiceDep) -> Ticker:
+    return await running_ticker(service, 0.0)
+
+
+async def _for_writing(service: ServiceDep) -> Ticker:
+    return await running_ticker(service, WRITES_WAIT_S)
+
+
+TickerDep = Annotated[Ticker, Depends(_for_reading)]
+WritingTickerDep = Annotated[Ticker, Depends(_for_writing)]
+
+
+@dataclass(frozen=True)
+class Applied:
+    """What a command did: the tick from which it holds, and the state right after it."""
+
+    tick: int
+    state: LiveState
+
+
+async def apply(ticker: Ticker, command: Command) -> Applied:
+    """Have a command applied before the next tick. Raises what the command raises."""
+    after: list[LiveState] = []
+
+    def noting(state: LiveState, tick: int) -> LiveState:
+        after.append(command(state, tick))
+        return after[0]
+
+    tick = await asyncio.wrap_future(ticker.apply(noting))
+    return Applied(tick, after[0])
+
+
+async def keep(service: Service, is_concerned: bool) -> None:
+    """Write the state file when something in it has changed."""
+    if is_concerned:
+        await asyncio.to_thread(service.live.keep)
+
+
+def reply_to(applied: Applied, record: dict[str, Any]) -> dict[str, Any]:
+    """A write's reply: what there is now, and since which tick."""
+    return {**record, "tick": applied.tick}

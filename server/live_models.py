@@ -1,0 +1,157 @@
+"""JSON replies about the live world. Field names are contract: clients read them."""
+
+from typing import Any
+
+from pydantic import BaseModel, Field
+
+from server.models import Vector3
+
+_TICK = Field(description="the tick that this was true in; of a write: the first in which it holds")
+
+
+class ClockReply(BaseModel):
+    time: str = Field(description="local time with offset, ISO 8601")
+    rate: float = Field(description="world seconds per second")
+    paused: bool
+    tick: int = _TICK
+
+
+class WeatherNow(BaseModel):
+    text: str = Field(description="what `weather` of a query takes to get this very weather")
+    cloud_cover: float
+    cloud_transmission: float
+    haze: float
+    fog_density: float
+    snow: float
+
+
+class WeatherReply(BaseModel):
+    asked: dict[str, Any] = Field(description="what PUT was told last: weather, script_seed or measured")
+    now: WeatherNow = Field(description="of this tick, on the way from one weather to another as well")
+    tick: int = _TICK
+
+
+class SettingsReply(BaseModel):
+    bounce_factor: float
+    sky_factor: float
+    sun_factor: float
+    lights_factor: float
+    sky_boost: Vector3
+    ambient_factor: float
+    ambient_up: Vector3
+    ambient_down: Vector3
+    exterior_ambient_scale: float
+    interior_ambient_scale: float
+    tick: int = _TICK
+
+
+class Light(BaseModel):
+    id: str
+    kind: str
+    position: Vector3
+    lumens: float
+    color: Vector3
+    range_m: float
+    direction: Vector3
+    cone_degrees: float
+    size: tuple[float, float]
+    schedule: str
+    dynamic: bool
+    keep: bool
+
+
+class LightReply(Light):
+    tick: int = _TICK
+
+
+class LightsReply(BaseModel):
+    lights: list[Light]
+    tick: int = _TICK
+
+
+class Whereabouts(BaseModel):
+    id: str
+    position: Vector3 = Field(description="world metres")
+    velocity: Vector3 = Field(description="m/s")
+    heading_degrees: float = Field(description="0 looks along -Z, 90 along +X")
+    since_tick: int = Field(description="when its walk began")
+    keep: bool
+
+
+class PlayerReply(Whereabouts):
+    speed: float
+    path: list[Vector3] | None = Field(None, description="null for a walk along streets")
+    loop: bool
+    pause_s: tuple[float, float]
+    turn_s: float
+    seed: int
+    walk_m: float
+    near: Vector3 | None = None
+    tick: int = _TICK
+
+
+class PlayersReply(BaseModel):
+    players: list[Whereabouts]
+    tick: int = _TICK
+
+
+class GoneReply(BaseModel):
+    id: str
+    tick: int = _TICK
+
+
+class Percentiles(BaseModel):
+    p50: float
+    p99: float
+    max: float
+
+
+class FailedSector(BaseModel):
+    sector: tuple[int, int]
+    attempts: int
+    retry_in_s: float
+    reason: str
+
+
+class Streams(BaseModel):
+    clients: int
+    frames: int
+    bytes: int
+
+
+class CacheCounts(BaseModel):
+    hits: int = Field(description="queries that were answered with bytes made before")
+    misses: int
+    bytes: int
+    player_volume_hits: int
+    player_volume_misses: int
+
+
+class LiveReply(BaseModel):
+    tick: int
+    tick_rate: int = Field(description="Hz")
+    tick_ms: Percentiles
+    parts_ms: dict[str, Percentiles]
+    lateness_ms: Percentiles = Field(description="by how much ticks began after they were due")
+    late_ticks: int = Field(description="ended after the next was due")
+    skipped: int = Field(description="had passed before they could begin")
+    ticks: int
+    failed_ticks: int
+    failure: str | None = Field(description="why the last tick failed; null when it did not")
+    misses: int = Field(description="sectors that volumes read and that were not there, summed over ticks")
+    loads: int
+    evictions: int
+    resident_sectors: int
+    resident_bytes: int
+    loading: int
+    failures: list[FailedSector]
+    relit: int
+    settled: int
+    volumes: int = Field(description="filled since the start")
+    waiting: int = Field(description="volumes that wait for another tick")
+    players: int
+    lamps: int
+    jumps: int = Field(description="changes of clock, weather and settings at once, which light follows at once")
+    streams: Streams
+    memory_bytes: int | None
+    cache: CacheCounts

@@ -1,0 +1,73 @@
+"""The irradiance volume around a simulated player, as the live world last filled it."""
+
+import asyncio
+from typing import Annotated
+
+from fastapi import APIRouter, Query, Request, Response
+
+from gi_core.live_volume import PublishedVolume
+from gi_core.volume import Volume
+from server.caching import strong_etag
+from server.dependencies import PlayerVolumeQuery, ServiceDep
+from server.encoding import MEDIA_TYPE, REPLY_VERSION
+from server.finished_replies import Body, names
+from server.live_access import TickerDep
+from server.live_state import LiveUnavailableError
+from server.player_volumes import VolumeKey
+from server.routes.players import IdInPath
+from server.routes.volume import light_body, mask_body
+from server.server_timing import Laps
+from server.service import Service
+from server.ticker import Ticker
+
+router = APIRouter(prefix="/v1/players", tags=["live world"])
+FIRST_FILL_S = 5.0
+# Every tick may bring another one.
+CACHE_CONTROL = "no-cache"
+
+
+@router.get(
+    "/{id}/volume",
+    response_class=Response,
+    responses={200: {"content": {media: {} for media in MEDIA_TYPE.values()}}, 304: {"description": "the client has the latest"}},
+)
+async def player_volume(
+    request: Request, service: ServiceDep, ticker: TickerDep, name: IdInPath, query: Annotated[PlayerVolumeQuery, Query()]
+) -> Response:
+    """The latest volume around a player, laid out as /v1/volume's. `Gi-Tick` is the tick in which it was filled: give it as `since` next
+    time. For a stream of what changes: the WebSocket `/v1/players/{id}/stream`, described in STREAM.md.
+    """
+    laps = Laps()
+    with laps.lap("wait"):
+        found = await _published(service, ticker, name)
+    etag = strong_etag("player volume", REPLY_VERSION, service.run_id, name, found.tick, query.format, query.encoding, query.mask)
+    headers = {"ETag": etag, "Cache-Control": CACHE_CONTROL, "Gi-Tick": str(found.tick)}
+    # A tick that has not been yet is from before a restart.
+    is_old = query.since is not None and found.tick <= query.since <= ticker.tick
+    if is_old or names(request.headers, etag):
+        return Response(status_code=304, headers=headers)
+
+    def encode() -> Body:
+        volume = Volume(found.values, found.mask, found.first_voxel, found.sectors, expected_error=service.expected_error)
+        return mask_body(volume, query) if query.mask else light_body(volume, query)
+
+    with laps.lap("encode"):
+        body = await service.player_volumes.get(VolumeKey(name, found.tick, query.format, query.encoding, query.mask), encode)
+    headers |= {**body.headers, "Server-Timing": laps.text}
+    return Response(body.content, media_type=body.media_type, headers=headers)
+
+
+async def _published(service: Service, ticker: Ticker, name: str) -> PublishedVolume:
+    """A player's latest volume; a new player's is waited for. Raises NoSuchThingError, LiveUnavailableError."""
+    give_up_at = asyncio.get_running_loop().time() + FIRST_FILL_S
+    while True:
+        since_tick = ticker.state.player(name).since_tick
+        found = ticker.world.published(name)
+        # One that is older is of a player that had the same name.
+        if found is not None and found.tick >= since_tick:
+            return found
+        left_s = give_up_at - asyncio.get_running_loop().time()
+        try:
+            await asyncio.wait_for(service.ticks.after(service.ticks.latest.tick), max(left_s, 0.0))
+        except TimeoutError as error:
+            raise LiveUnavailableError(f"player {name}: no volume yet; ask again in a moment") from error

@@ -1,0 +1,271 @@
+"""The WebSocket stream of a player's volume: what a client holds, and what becomes of clients that misbehave."""
+
+import contextlib
+import gc
+import io
+import json
+import os
+import socket
+import struct
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from fastapi import FastAPI
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import ClientConnection, connect
+
+from server.app import create_app
+from server.frame_prefix import FrameKind
+from server.live import LiveOptions
+from server.player_streams import PlayerStreams, is_full_request
+from server.settings import Settings
+from server.stream_header import parse_header
+from server.volume_frames import Frame, VolumeDecoder, VolumeEncoder
+
+PATIENCE_S = 20.0
+
+
+def until(found: Callable[[], Any]) -> Any:
+    """What a function gives, once that is true."""
+    deadline = time.monotonic() + PATIENCE_S
+    while not (value := found()):
+        assert time.monotonic() < deadline, "it did not come to that"
+        time.sleep(0.02)
+    return value
+
+
+class Follower:
+    """A client that holds what it was sent."""
+
+    def __init__(self, connection: ClientConnection) -> None:
+        self.connection = connection
+        self.header = parse_header(connection.recv(timeout=PATIENCE_S))
+        self.decoder = VolumeDecoder(self.header)
+
+    def next(self, timeout_s: float = PATIENCE_S) -> Frame:
+        return self.decoder.decode(self.connection.recv(timeout=timeout_s))
+
+    def close_code(self) -> int:
+        """Reads until the server closes."""
+        try:
+            while True:
+                self.connection.recv(timeout=PATIENCE_S)
+        except ConnectionClosed as closed:
+            return -1 if closed.rcvd is None else closed.rcvd.code
+
+    def until_silent(self) -> None:
+        """Reads until the world has settled, and nothing is worth a message."""
+        with contextlib.suppress(TimeoutError):
+            for _ in range(1000):
+                self.next(1.0)
+            raise AssertionError("the world does not settle")
+
+
+@contextmanager
+def following(http: httpx.Client, player: str) -> Iterator[Follower]:
+    address = f"ws://{http.base_url.netloc.decode()}/v1/players/{player}/stream"
+    with connect(address, compression=None, max_size=1 << 24, open_timeout=PATIENCE_S, close_timeout=2) as connection:
+        yield Follower(connection)
+
+
+def first_message_closes(http: httpx.Client, player: str) -> int:
+    address = f"ws://{http.base_url.netloc.decode()}/v1/players/{player}/stream"
+    with connect(address, open_timeout=PATIENCE_S) as connection:
+        with pytest.raises(ConnectionClosed) as closed:
+            connection.recv(timeout=PATIENCE_S)
+        assert closed.value.rcvd is not None
+        return closed.value.rcvd.code
+
+
+@pytest.fixture
+def streams(live_app: FastAPI, live_http: httpx.Client) -> PlayerStreams:
+    found = live_app.state.service.streams
+    until(lambda: found.clients == 0)
+    return found
+
+
+@pytest.fixture
+def racing(live_http: httpx.Client) -> Iterator[None]:
+    """The sun races: there is a frame in every tick."""
+    live_http.put("/v1/weather", json={"weather": "clear"})
+    live_http.put("/v1/clock", json={"time": "2024-06-21T09:00", "rate": 1200, "paused": False})
+    yield
+    live_http.put("/v1/clock", json={"time": "12:00", "rate": 1, "paused": True})
+
+
+@pytest.fixture
+def resting(live_http: httpx.Client) -> None:
+    live_http.put("/v1/weather", json={"weather": "overcast:cloud_cover=1.0"})
+    live_http.put("/v1/clock", json={"time": "2024-06-21T12:00", "rate": 1, "paused": True})
+
+
+def test_a_client_holds_the_server_s_volume(live_http: httpx.Client, player: str, resting: None, streams: PlayerStreams) -> None:
+    with following(live_http, player) as follower:
+        assert follower.header.tick_rate == 20
+        assert follower.next().prefix.kind == FrameKind.FULL
+        follower.until_silent()
+        reply = live_http.get(f"/v1/players/{player}/volume")
+        light = np.load(io.BytesIO(reply.content))
+        facts = json.loads(reply.headers["gi-volume"])
+        centre = (follower.decoder.first_voxel + 0.5) * follower.header.voxel_size
+        assert centre.tolist() == facts["origin"]
+        mask = np.load(io.BytesIO(live_http.get(f"/v1/players/{player}/volume", params={"mask": 1}).content))
+        assert np.array_equal(follower.decoder.mask, mask)
+        # 1 % of the voxel's largest coefficient, some of the volume's, and the half's rounding: STREAM.md.
+        largest = light.max(axis=(0, 4))
+        bound = 0.0105 * largest + 2.0**-15 * light.max()
+        assert (np.abs(follower.decoder.values - light) <= bound[..., None]).all()
+        sent = streams.counts.bytes
+        live_http.put("/v1/clock", json={"time": "18:00"})
+        assert follower.next().prefix.kind == FrameKind.DELTA
+        assert streams.counts.bytes > sent
+
+
+def test_frames_come_with_ticks(live_http: httpx.Client, player: str, racing: None) -> None:
+    with following(live_http, player) as follower:
+        frames = [follower.next() for _ in range(10)]
+        ticks = [frame.prefix.tick for frame in frames]
+        assert ticks == sorted(set(ticks))
+        assert [frame.prefix.kind for frame in frames] == [FrameKind.FULL] + [FrameKind.DELTA] * 9
+        assert all(frame.prefix.base == before for frame, before in zip(frames[1:], ticks, strict=False))
+        assert abs(frames[-1].prefix.time_us / 1e6 - time.time()) < PATIENCE_S
+        assert live_http.get("/v1/live").json()["streams"]["clients"] >= 1
+
+
+def test_a_full_frame_comes_on_request_also_when_nothing_changes(live_http: httpx.Client, player: str, resting: None) -> None:
+    with following(live_http, player) as follower:
+        follower.until_silent()
+        follower.connection.send('{"type": "full"}')
+        assert follower.next().prefix.kind == FrameKind.FULL
+
+
+@pytest.mark.parametrize(
+    ("message", "code"),
+    [(b"\x00", 1003), ("hello", 1008), ("[]", 1008), ('{"type": "everything"}', 1008), ("[" * 900, 1008), ("x" * 5000, 1009)],
+)
+def test_garbage_ends_a_stream(live_http: httpx.Client, player: str, streams: PlayerStreams, message: str | bytes, code: int) -> None:
+    with following(live_http, player) as follower:
+        follower.connection.send(message)
+        assert follower.close_code() == code
+    until(lambda: streams.clients == 0)
+
+
+def test_only_a_request_for_a_full_frame_is_one() -> None:
+    assert is_full_request('{"type": "full"}')
+    assert not any(map(is_full_request, ("", "full", '{"type": 1}', "{}", "null", "[" * 100_000)))
+
+
+def test_a_player_that_is_not_there(live_http: httpx.Client, player: str) -> None:
+    assert first_message_closes(live_http, "nobody") == 4404
+    with following(live_http, player) as follower:
+        follower.next()
+        live_http.delete(f"/v1/players/{player}")
+        assert follower.close_code() == 4404
+
+
+def test_there_is_a_limit_of_streams(live_http: httpx.Client, player: str, streams: PlayerStreams, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("server.player_streams.MAX_CLIENTS", 1)
+    with following(live_http, player) as follower:
+        follower.next()
+        assert first_message_closes(live_http, player) == 1013
+    until(lambda: streams.clients == 0)
+    with following(live_http, player) as follower:
+        follower.next()
+
+
+def raw_stream(http: httpx.Client, player: str) -> socket.socket:
+    """A connection that has shaken hands, and reads no further."""
+    connection = socket.socket()
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 14)
+    connection.settimeout(PATIENCE_S)
+    connection.connect((http.base_url.host, http.base_url.port))
+    connection.sendall(
+        f"GET /v1/players/{player}/stream HTTP/1.1\r\nHost: x\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+        "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13\r\n\r\n".encode()
+    )
+    assert connection.recv(12) == b"HTTP/1.1 101"
+    return connection
+
+
+def test_a_client_that_stops_reading_costs_a_message_and_holds_up_nobody(
+    live_http: httpx.Client, player: str, racing: None, streams: PlayerStreams
+) -> None:
+    with raw_stream(live_http, player):
+        # Full frames, as many as it can be sent: what the system buffers is soon full.
+        stalled, since = -1, time.monotonic()
+        deadline = since + PATIENCE_S
+        while time.monotonic() - since < 1.5:
+            assert time.monotonic() < deadline, "it was sent more and more"
+            if streams.counts.bytes != stalled:
+                stalled, since = streams.counts.bytes, time.monotonic()
+            time.sleep(0.05)
+        assert stalled < 8 << 20  # the system's own buffers on a loopback
+        with following(live_http, player) as follower:
+            first = follower.next().prefix.tick
+            last = [follower.next() for _ in range(20)][-1].prefix.tick
+            assert last - first < 60  # 20 of at most 60 ticks: nobody waits for the one that does not read
+    until(lambda: streams.clients == 0)
+
+
+def test_a_client_that_vanishes_is_forgotten(live_http: httpx.Client, player: str, racing: None, streams: PlayerStreams) -> None:
+    connection = raw_stream(live_http, player)
+    until(lambda: streams.clients == 1)
+    # A reset, as when its machine was switched off and on again.
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    connection.close()
+    until(lambda: streams.clients == 0)
+
+
+def come_and_go(http: httpx.Client, player: str, streams: PlayerStreams, times: int) -> None:
+    """Connect, take something and leave, in turns politely and not; nothing may be left of it."""
+
+    def left() -> tuple[int, int]:
+        gc.collect()
+        encoders = sum(isinstance(found, VolumeEncoder) for found in gc.get_objects())
+        return encoders, len(os.listdir("/proc/self/fd"))
+
+    with following(http, player) as follower:
+        follower.next()
+    until(lambda: streams.clients == 0)
+    time.sleep(0.5)
+    _, descriptors = left()
+    for number in range(times):
+        if number % 3:
+            with raw_stream(http, player):
+                pass
+        else:
+            with following(http, player) as follower:
+                follower.next()
+    until(lambda: streams.clients == 0)
+    # A connection or two of the test's own client may come or go meanwhile.
+    until(lambda: left()[0] == 0 and left()[1] <= descriptors + 2)
+
+
+def test_fifty_clients_come_and_go_without_a_trace(live_http: httpx.Client, player: str, racing: None, streams: PlayerStreams) -> None:
+    come_and_go(live_http, player, streams, 50)
+
+
+@pytest.mark.slow
+def test_a_thousand_clients_come_and_go_without_a_trace(live_http: httpx.Client, player: str, racing: None, streams: PlayerStreams) -> None:
+    come_and_go(live_http, player, streams, 1000)
+
+
+def test_a_server_that_stops_says_so(city: Any, serving: Any, wait_until_live: Any, street: tuple[float, ...]) -> None:
+    app = create_app(city, Settings(live=LiveOptions(ticks_per_second=10)))
+    with serving(app) as http:
+        wait_until_live(http)
+        http.post("/v1/players", json={"id": "a", "path": [street], "speed": 0})
+        address = f"ws://{http.base_url.netloc.decode()}/v1/players/a/stream"
+        follower = Follower(connect(address, max_size=1 << 24, open_timeout=PATIENCE_S))
+        follower.next()
+        deaf = raw_stream(http, "a")
+        stopping = time.monotonic()
+    assert follower.close_code() == 1001
+    assert time.monotonic() - stopping < 10
+    assert app.state.service.live.started_ticker.is_stopped
+    deaf.close()

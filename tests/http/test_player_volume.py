@@ -1,0 +1,87 @@
+"""A player's latest volume: the same layout as a query's, asked for again only when there is a later one."""
+
+import json
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+
+import httpx
+import pytest
+
+PATIENCE_S = 20.0
+NOON = "2024-06-21T12:00"
+# The live world's sunlight comes from a shadow map where a query's comes from baked directions: without a sun both are alike.
+SUNLESS = "overcast:cloud_cover=1.0"
+
+
+@pytest.fixture
+def settled(live_http: httpx.Client, player: str) -> Iterator[str]:
+    """A player in a world that stands still and whose light has settled: no new volume comes."""
+    live_http.put("/v1/weather", json={"weather": SUNLESS})
+    live_http.put("/v1/clock", json={"time": NOON, "paused": True})
+    deadline, last, since = time.monotonic() + PATIENCE_S, "", time.monotonic()
+    while time.monotonic() - since < 1.5:
+        assert time.monotonic() < deadline, "the light did not settle"
+        tick = live_http.get(f"/v1/players/{player}/volume", params={"mask": 1}).headers["gi-tick"]
+        if tick != last:
+            last, since = tick, time.monotonic()
+        time.sleep(0.05)
+    yield player
+    live_http.put("/v1/clock", json={"paused": False})
+
+
+def test_a_settled_volume_is_the_query_s(live_http: httpx.Client, settled: str, street: tuple[float, float, float]) -> None:
+    x, y, z = street
+    query = {"time": NOON, "weather": SUNLESS, "x": x, "y": y, "z": z}
+    for parameters in ({}, {"mask": 1}, {"format": "raw"}):
+        live = live_http.get(f"/v1/players/{settled}/volume", params=parameters)
+        asked = live_http.get("/v1/volume", params=query | parameters)
+        facts, expected = json.loads(live.headers["gi-volume"]), json.loads(asked.headers["gi-volume"])
+        assert (facts["origin"], facts["shape"], facts["dtype"]) == (expected["origin"], expected["shape"], expected["dtype"])
+        assert live.headers["content-type"] == asked.headers["content-type"]
+        assert live.content == asked.content
+
+
+def test_nothing_newer_is_304(live_http: httpx.Client, settled: str) -> None:
+    path = f"/v1/players/{settled}/volume"
+    first = live_http.get(path)
+    tick = int(first.headers["gi-tick"])
+    for reply in (
+        live_http.get(path, params={"since": tick}),
+        live_http.get(path, params={"since": tick + 1}),
+        live_http.get(path, headers={"If-None-Match": first.headers["etag"]}),
+    ):
+        assert (reply.status_code, reply.content, reply.headers["etag"]) == (304, b"", first.headers["etag"])
+    assert live_http.get(path, params={"since": tick - 1}).content == first.content
+    # A tick that is yet to come is one of another run of the server.
+    assert live_http.get(path, params={"since": tick + 10**9}).status_code == 200
+    live_http.put("/v1/clock", json={"time": "17:00"})
+    deadline = time.monotonic() + PATIENCE_S
+    while (later := live_http.get(path, params={"since": tick})).status_code == 304:
+        assert time.monotonic() < deadline
+    assert int(later.headers["gi-tick"]) > tick
+    assert later.headers["etag"] != first.headers["etag"]
+
+
+def test_many_readers_cost_one_encoding(live_http: httpx.Client, settled: str) -> None:
+    def encoded() -> int:
+        return live_http.get("/v1/live").json()["cache"]["player_volume_misses"]
+
+    before = encoded()
+    with ThreadPoolExecutor(8) as readers:
+        replies = list(readers.map(lambda _: live_http.get(f"/v1/players/{settled}/volume", params={"format": "raw"}), range(24)))
+    assert {reply.status_code for reply in replies} == {200}
+    assert len({reply.content for reply in replies}) == 1
+    assert encoded() == before + 1
+
+
+def test_what_took_how_long_is_told_where_something_was_computed(live_http: httpx.Client, settled: str) -> None:
+    assert "encode;dur=" in live_http.get(f"/v1/players/{settled}/volume").headers["server-timing"]
+    query = {"time": "12:34", "weather": "fog:0.123", "x": 32, "y": 5, "z": 32}
+    first = live_http.get("/v1/volume", params=query)
+    names = [part.partition(";dur=")[0] for part in first.headers["server-timing"].split(", ")]
+    assert names == ["light", "relight", "encode"]
+    again = live_http.get("/v1/volume", params=query)
+    assert again.content == first.content
+    assert "server-timing" not in again.headers
+    assert "compute;dur=" in live_http.get("/v1/lighting", params={"time": "12:34", "weather": "fog:0.321"}).headers["server-timing"]
