@@ -26,6 +26,8 @@ from gi_core.world import Lamp
 # After a change this large, as a share, a relight makes several passes, so that bounces follow at once.
 BURST_CHANGE = 0.05
 BURST_PASSES = 3
+# Before a sector is shown for the first time: what later bounces add is then a hundredth.
+FIRST_PASSES = 8
 # From loaded to fully shown: half a second at 30 Hz, so that nothing pops when a sector arrives late.
 FADE_TICKS = 15
 
@@ -158,10 +160,13 @@ class LiveSector:
         self.is_lit = True
         return True
 
-    def advance(self, tick: int, changed: bool) -> None:
-        """Say whether what is shown changes at a tick: by a relight or other gains (``changed``), or because it fades in."""
+    def advance(self, tick: int, changed: bool, is_read: bool) -> None:
+        """Say whether what is shown changes at a tick: by a relight or other gains (``changed``), or because it fades in.
+
+        A sector fades in where something stood for it: while no published volume reads it (``is_read``), it arrives unseen.
+        """
         if self.is_lit and self._faded < FADE_TICKS:
-            self._faded += 1
+            self._faded = self._faded + 1 if is_read else FADE_TICKS
             changed = True
         if changed:
             self.shown_at = tick

@@ -14,6 +14,7 @@ anybody's. No file is read and no kernel compiled in it, once ``warm_up`` has ru
 
 import threading
 import time
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import product
@@ -29,7 +30,7 @@ from gi_core.grid import SectorIndex, volume_first_voxel
 from gi_core.layout import DIRECTIONAL_LIGHT, MAX_DIRECTIONAL_LIGHTS
 from gi_core.light_geometry import ShadowGeometry
 from gi_core.light_needs import WHOLLY, LightNeeds
-from gi_core.live_sector import BURST_CHANGE, BURST_PASSES, LiveLight, LiveSector
+from gi_core.live_sector import BURST_CHANGE, BURST_PASSES, FIRST_PASSES, LiveLight, LiveSector
 from gi_core.live_shadows import LiveShadows
 from gi_core.live_volume import LiveVolume, PublishedVolume
 from gi_core.relight import Relighter
@@ -42,7 +43,9 @@ from gi_core.stream_plan import StreamOptions, StreamPlan
 from gi_core.tick_plan import PLACES, plan_tick
 from gi_core.volume import box_record, plan_boxes
 
-DEFAULT_BUDGET_BYTES = 384 << 20
+DEFAULT_BUDGET_BYTES = 512 << 20
+# A new player's first volume is held back until all of its sectors are lit, but not for longer than two seconds at 30 Hz.
+HELD_TICKS = 60
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +61,7 @@ class TickPlayers:
 class TickReport:
     """What a tick did. Times in milliseconds.
 
-    relit, settled : sectors that were lit; missing : those that volumes read and that are not there
+    relit, settled : sectors that were lit; missing : those that published volumes read and that are not there, or not lit yet
     filled : players whose volume was filled; waiting : how many volumes wait for another tick
     """
 
@@ -107,6 +110,8 @@ class LiveWorld:
         self._firsts: dict[str, bytes] = {}
         self._readers: dict[SectorIndex, set[str]] = {}
         self._stale: dict[str, int] = {}
+        self._shown_to: Counter[SectorIndex] = Counter()
+        """How many published volumes read each sector, there or not."""
         self._light: LiveLight | None = None
         self._distant_sky = dataset.distant()
         self._shadows = LiveShadows(self._device, dataset) if shadow_map else None
@@ -141,7 +146,7 @@ class LiveWorld:
         for index in report.loaded:
             self._needs.forget(self._row[index])
         self.plan = self.streamer.step(players.positions, players.velocities)
-        report.evicted, report.missing = self.plan.evictions, self.plan.missing
+        report.evicted = self.plan.evictions
         lap("stream")
         gains_changed = self._light is not None and self._light.settings != light.settings
         self._light = light
@@ -152,10 +157,11 @@ class LiveWorld:
             for index in sampled:
                 self._needs.disturb(self._row[index], BURST_CHANGE)
         lap("shadow_map")
+        report.missing = tuple(index for index in self._shown_to if not self._is_lit(index))
         lit = set(report.relit) | set(report.settled)
         changed = list(report.evicted)
         for index, sector in self.streamer.residents.items():
-            sector.advance(tick, gains_changed or index in lit)
+            sector.advance(tick, gains_changed or index in lit, index in self._shown_to)
             if sector.shown_at == tick:
                 changed.append(index)
         self._note_readers(tick, players, changed)
@@ -218,7 +224,7 @@ class LiveWorld:
         change_of = dict(zip(rows.tolist(), changes.tolist(), strict=True))
         sectors = [residents[self.streamer.table.sectors[row]] for row in chosen]
         for row, sector in zip(chosen, sectors, strict=True):
-            passes = BURST_PASSES if change_of[row] > BURST_CHANGE else 1
+            passes = 1 if change_of[row] <= BURST_CHANGE else BURST_PASSES if sector.is_lit else FIRST_PASSES
             sector.relight(self._relighter, light, passes)
             report.passes += passes
         for row, sector in zip(chosen, sectors, strict=True):
@@ -237,8 +243,7 @@ class LiveWorld:
     def _note_readers(self, tick: int, players: TickPlayers, changed: Sequence[SectorIndex]) -> None:
         """Find the volumes that have to be filled: of players who moved to other voxels, and those that read a changed sector."""
         for gone in self.volumes.keys() - set(players.ids):
-            for index in self.volumes.pop(gone).touched:
-                self._readers[index].discard(gone)
+            self._unread(gone, self.volumes.pop(gone))
             self._stale.pop(gone, None)
             del self._firsts[gone]
         firsts = volume_first_voxel(players.positions)
@@ -249,26 +254,45 @@ class LiveWorld:
                 volume = self.volumes.get(name)
                 if volume is None:
                     volume = self.volumes[name] = LiveVolume(self._device)
-                for index in volume.touched:
-                    self._readers[index].discard(name)
+                self._unread(name, volume)
                 volume.move(firsts[row], self._known)
                 for index in volume.touched:
                     self._readers.setdefault(index, set()).add(name)
+                if volume.published is not None:
+                    self._shown_to.update(volume.touched)
                 self._stale.setdefault(name, tick)
         for index in changed:
             for name in self._readers.get(index, ()):
                 self._stale.setdefault(name, tick)
 
+    def _unread(self, name: str, volume: LiveVolume) -> None:
+        """A player's volume no longer reads what it read."""
+        for index in volume.touched:
+            self._readers[index].discard(name)
+        if volume.published is not None:
+            self._shown_to.subtract(volume.touched)
+            self._shown_to = +self._shown_to
+
+    def _is_lit(self, index: SectorIndex) -> bool:
+        return index in self.streamer.residents and self.streamer.residents[index].is_lit
+
     def _fill(self, tick: int, light: LiveLight, report: TickReport, until: float) -> None:
         residents = self.streamer.residents
         filled: list[str] = []
+        held = 0
         for name in sorted(self._stale, key=lambda name: (self._stale[name], name)):
             if filled and time.perf_counter() >= until:
                 break
-            self.volumes[name].fill(tick, residents, lambda sector: self._shown(sector, light), self._placeholder)
+            volume, arriving = self.volumes[name], self.volumes[name].published is None
+            if arriving and tick < self._stale[name] + HELD_TICKS and not all(map(self._is_lit, volume.touched)):
+                held += 1
+                continue
+            volume.fill(tick, residents, lambda sector: self._shown(sector, light), self._placeholder)
+            if arriving:
+                self._shown_to.update(volume.touched)
             del self._stale[name]
             filled.append(name)
-        report.filled, report.waiting = tuple(filled), len(self._stale)
+        report.filled, report.waiting = tuple(filled), len(self._stale) - held
 
     def _shown(self, sector: LiveSector, light: LiveLight) -> cl.Buffer:
         return sector.shown(light.settings, lambda: self._placeholder(sector.resident.sector.index))
