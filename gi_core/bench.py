@@ -177,8 +177,9 @@ def bench_decode(device: Device, rounds: int = 30) -> Measurement:
 
 def run(device_name: str | None = None, quick: bool = False) -> list[Measurement]:
     """All measurements of this module on one device; ``quick`` ones are a look, not a result. Raises DeviceError."""
-    from gi_core import bench_relight  # which imports this module
+    from gi_core import bench_relight, bench_roofline  # which import this module
 
     device = shared_device(device_name)
     relight = bench_relight.run(device, quick)
-    return [*relight, bench_volume(device, 10 if quick else 100), bench_decode(device, 3 if quick else 30)]
+    rows = [*relight, bench_volume(device, 10 if quick else 100), bench_decode(device, 3 if quick else 30)]
+    return rows if quick else [*rows, *bench_roofline.run(device.name)]
