@@ -55,9 +55,9 @@ class _Side:
 def bench_features(device: Device, rounds: int = 160) -> list[Measurement]:
     """Each feature beside the same tick without it. The light changes at every tick, so what is only done then counts in full.
 
-    ``us_added`` and ``bytes_added`` are for two sectors; snow's attribute is the fourth component of an albedo, so it adds no bytes. Without a feature its kernels have no code for it and there is no buffer, so the baseline is a
-    tick that never knew of it. Interiors and fog have no rows: rooms are voxels' business and fog is the sky's, and the relighter
-    has no code for either.
+    ``us_added`` and ``bytes_added`` are for two sectors; snow's attribute is the fourth component of an albedo, so it adds no bytes.
+    Without a feature its kernels have no code for it and there is no buffer, so the baseline is a tick that never knew of it. Interiors
+    and fog have no rows: rooms are voxels' business and fog is the sky's, and the relighter has no code for either.
     """
     plain = [talk_size_sector(seed) for seed in range(ROTATION)]
     rng = np.random.default_rng(0)

@@ -7,6 +7,8 @@ What changes seldom is worked out when it changes, and a pass only does what eve
     every pass      bounce_bricks, gather_probes
 """
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,6 +20,8 @@ from gi_core.device import Device, SharedKernel
 from gi_core.layout import BOUNCE
 from gi_core.relight_input import RelightInput
 from gi_core.sector import Sector, starts
+
+Launch = Callable[..., None]
 
 # Work-items per work-group; kernels guard against the last group's excess.
 GROUP = 16
@@ -72,6 +76,7 @@ class ResidentSector:
         self._light: LightOnDevice | None = None
         self._direct_of: object = None
         self._bounces_of: float | None = None
+        self._launches: dict[str, tuple[tuple[object, ...], Launch]] = {}
 
     @property
     def nbytes(self) -> int:
@@ -109,9 +114,11 @@ class ResidentSector:
             self._collect_bounces(snow)
             self._bounces_of = snow
         if self._direct_of != light.identity:
-            if light.lights is not None:
-                self._light_surfels(light)
-            self._light_bricks(light, snow)
+            count, shining = len(light.given.lights), [] if light.lights is None else [light.lights]
+            if shining:
+                self._prepared("sun_on_surfels", (count, self.sun_sample), partial(self._sun_on_surfels, count))(*shining)
+            about = (count, snow, self._lamps, self.sun_share)
+            self._prepared("light_bricks", about, partial(self._light_bricks, count, snow))(*shining)
             self._direct_of = light.identity
 
     def enqueue_pass(self) -> None:
@@ -120,14 +127,8 @@ class ResidentSector:
         if sector.probe_count == 0:
             return
         assert light is not None
-        patches = len(light.given.patch_exitance)
-        arguments: list[Any] = [np.uint32(sector.brick_count), self.bounce_starts or self.direct, self.bounces or self.direct, self.direct]
-        arguments += [self.cubes, np.uint32(patches), light.patches, self.exitance]
-        self._launch(self.device.shared_kernel("bounce_bricks"), sector.brick_count + patches, *arguments)
-        vectors = -(-sector.basis_size // WEIGHTS_PER_VECTOR)
-        kernel = self.device.shared_kernel("gather_probes", BASIS_SIZE=sector.basis_size, WEIGHT_VECTORS=vectors)
-        factors = (self.factor_starts, self.factor_source, self.factor_weight)
-        self._launch(kernel, sector.probe_count, np.uint32(sector.probe_count), *factors, self.exitance, self.cubes)
+        self._prepared("bounce_bricks", (self.bounces,), self._bounce_bricks)(light.patches)
+        self._prepared("gather_probes", (), self._gather_probes)()
 
     def fill_volume(self, box: AnyArray, size: tuple[int, ...], target: cl.Buffer) -> None:
         """Enqueue this sector's part of a volume: ``box`` (1,) layout.VOLUME_BOX, its size (x, y, z), the volume's buffer."""
@@ -148,24 +149,31 @@ class ResidentSector:
             padded[..., :3] = cubes
             cl.enqueue_copy(self.device.queue, self.cubes, padded)
 
-    def _launch(self, kernel: SharedKernel, items: int, *arguments: Any) -> None:
-        kernel.launch((-(-items // GROUP) * GROUP,), (GROUP,), *arguments)
+    def _launch(self, kernel: SharedKernel, items: int, *arguments: Any) -> Launch:
+        """A launch that lacks no argument, or only the last ones."""
+        return partial(kernel.launch, (-(-items // GROUP) * GROUP,), (GROUP,), *arguments)
 
-    def _light_surfels(self, light: LightOnDevice) -> None:
-        count = len(light.given.lights)
+    def _prepared(self, name: str, about: tuple[object, ...], make: Callable[[], Launch]) -> Launch:
+        """The launch that ``make`` made when this was last ``about`` the same: gathering arguments takes as long as a launch itself."""
+        known = self._launches.get(name)
+        if known is None or known[0] != about:
+            known = self._launches[name] = about, make()
+        return known[1]
+
+    def _sun_on_surfels(self, count: int) -> Launch:
+        """Lacks the lights."""
         if self.sun_visibility is None:
             self.sun_visibility = self.device.upload(self.sector.sun_visibility)
         if self.sun_share is None or self.sun_share.size < count * self._groups * SURFELS_PER_GROUP * 4:
             self.sun_share = self.device.allocate(count * self._groups * SURFELS_PER_GROUP * 4)
         kernel = self.device.shared_kernel("sun_on_surfels", DIRECTIONAL_LIGHTS=count, HAS_SUN_MAP=int(self.sun_sample is not None))
-        arguments: list[Any] = [np.uint32(self._groups), self.surfel_normal, self.sun_visibility]
-        arguments += [np.uint32(4 * self.sector.sun_visibility.shape[1]), light.lights]
-        if self.sun_sample is not None:
-            arguments.append(self.sun_sample)
-        self._launch(kernel, self._groups, *arguments, self.sun_share)
+        sample = [] if self.sun_sample is None else [self.sun_sample]
+        plane_bytes = np.uint32(4 * self.sector.sun_visibility.shape[1])
+        surfels = (np.uint32(self._groups), self.surfel_normal, self.sun_visibility, plane_bytes)
+        return self._launch(kernel, self._groups, *surfels, *sample, self.sun_share)
 
-    def _light_bricks(self, light: LightOnDevice, snow: float) -> None:
-        count = len(light.given.lights)
+    def _light_bricks(self, count: int, snow: float) -> Launch:
+        """Lacks the lights, if there are any."""
         kernel = self.device.shared_kernel(
             "light_bricks",
             DIRECTIONAL_LIGHTS=count,
@@ -175,12 +183,27 @@ class ResidentSector:
         )
         arguments: list[Any] = [np.uint32(self.sector.brick_count), self.brick_starts, self.surfel_albedo]
         arguments += [buffer for buffer in (self.brick_emission, self._lamps) if buffer is not None]
-        if count:
-            arguments += [self.sun_share, np.uint32(self._groups * SURFELS_PER_GROUP), light.lights]
         arguments.append(self.direct)
         if snow > 0:
             arguments.append(np.float32(snow))
-        self._launch(kernel, self.sector.brick_count, *arguments)
+        if count:
+            arguments += [self.sun_share, np.uint32(self._groups * SURFELS_PER_GROUP)]
+        return self._launch(kernel, self.sector.brick_count, *arguments)
+
+    def _bounce_bricks(self) -> Launch:
+        """Lacks the sky patches."""
+        bricks, patches = self.sector.brick_count, self._sky_patches
+        bounces = (self.bounce_starts or self.direct, self.bounces or self.direct)
+        kernel = self.device.shared_kernel("bounce_bricks")
+        counts = (np.uint32(bricks), np.uint32(patches))
+        return self._launch(kernel, bricks + patches, *counts, *bounces, self.direct, self.cubes, self.exitance)
+
+    def _gather_probes(self) -> Launch:
+        sector = self.sector
+        vectors = -(-sector.basis_size // WEIGHTS_PER_VECTOR)
+        kernel = self.device.shared_kernel("gather_probes", BASIS_SIZE=sector.basis_size, WEIGHT_VECTORS=vectors)
+        factors = (self.factor_starts, self.factor_source, self.factor_weight)
+        return self._launch(kernel, sector.probe_count, np.uint32(sector.probe_count), *factors, self.exitance, self.cubes)
 
     def _collect_bounces(self, snow: float) -> None:
         """Bounces of the sector under this much snow. Which there are does not depend on the snow: the first time counts them."""
@@ -201,7 +224,7 @@ class ResidentSector:
             surfels = [self.surfel_albedo, self.surfel_normal, np.uint32(self._groups * SURFELS_PER_GROUP)]
             bricks = np.uint32(sector.brick_count)
             written = (bounce_starts, bounces, count)
-            self._launch(kernel, sector.brick_count, bricks, self.brick_starts, *surfels, probe, *weight, *written, *last)
+            self._launch(kernel, sector.brick_count, bricks, self.brick_starts, *surfels, probe, *weight, *written, *last)()
 
         if self.bounce_starts is None:
             most = 3 * sector.feedback_probe.shape[1]
