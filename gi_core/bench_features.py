@@ -1,13 +1,14 @@
 """What each feature of the relighter adds to a tick of two sectors, and what it keeps on the device for them."""
 
 import itertools
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pyopencl as cl
 
-from gi_core.bench import SKY_PATCHES, TALK_PROBES, Measurement, side_by_side, talk_size_sector
+from gi_core.bench import SKY_PATCHES, TALK_PROBES, Measurement, talk_size_sector
 from gi_core.bench_relight import ROTATION, Ticks, moving_suns
 from gi_core.device import Device
 from gi_core.relight import Relighter
@@ -54,9 +55,9 @@ class _Side:
 def bench_features(device: Device, rounds: int = 160) -> list[Measurement]:
     """Each feature beside the same tick without it. The light changes at every tick, so what is only done then counts in full.
 
-    ``bytes_added`` is for two sectors. Without a feature its kernels have no code for it and there is no buffer, so the baseline is a
-    tick that never knew of it. Interiors and fog have no rows: rooms are voxels' business and fog is the sky's, and the relighter
-    has no code for either.
+    ``us_added`` and ``bytes_added`` are for two sectors; snow's attribute is the fourth component of an albedo, so it adds no bytes.
+    Without a feature its kernels have no code for it and there is no buffer, so the baseline is a tick that never knew of it. Interiors
+    and fog have no rows: rooms are voxels' business and fog is the sky's, and the relighter has no code for either.
     """
     plain = [talk_size_sector(seed) for seed in range(ROTATION)]
     rng = np.random.default_rng(0)
@@ -82,8 +83,8 @@ def bench_features(device: Device, rounds: int = 160) -> list[Measurement]:
         )
 
     def feature(name: str, on: _Side, off: _Side, **sizes: int) -> Measurement:
-        with_it, without_it = side_by_side(on.ticks(device), off.ticks(device), rounds)
-        sizes = {"us_added": round(1e6 * (with_it - without_it)), "bytes_added": on.nbytes - off.nbytes} | sizes
+        with_it, without_it, added = _paired(on.ticks(device), off.ticks(device), rounds)
+        sizes = {"us_added": round(1e6 * added), "bytes_added": on.nbytes - off.nbytes} | sizes
         what = "the same tick without it"
         return Measurement(f"feature_{name}", 1e3 * with_it, "ms", 1e3 * without_it, without_it / with_it, sizes, device.name, what)
 
@@ -96,6 +97,20 @@ def bench_features(device: Device, rounds: int = 160) -> list[Measurement]:
         feature("feedback_weights", side([_weighted(s, rng) for s in plain], sun), side(plain, sun)),
         feature("shadow_map", sampled(), side(plain, sun), bytes_shared=worst.shadow_map.nbytes),
     ]
+
+
+def _paired(on: Callable[[], None], off: Callable[[], None], rounds: int) -> tuple[float, float, float]:
+    """Median times [s] of two things that take turns, and the median of what each turn's differ by: other work on the machine slows
+    neighbours alike."""
+    taken = []
+    for _ in range(rounds + ROTATION):
+        for run in (on, off):
+            started = time.perf_counter()
+            run()
+            taken.append(time.perf_counter() - started)
+    pairs = np.array(taken[2 * ROTATION :]).reshape(-1, 2)
+    with_it, without_it = np.median(pairs, axis=0).tolist()
+    return with_it, without_it, float(np.median(pairs[:, 0] - pairs[:, 1]))
 
 
 def _weighted(sector: Sector, rng: np.random.Generator) -> Sector:

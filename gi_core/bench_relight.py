@@ -57,6 +57,13 @@ def made_up_city() -> Geometry:
     return Geometry(corners.reshape(-1, 3), triangles, colours, colours)
 
 
+def snowy_sectors() -> list[Sector]:
+    """Sectors of the talk's size for one rotation, snow all over them."""
+    rng = np.random.default_rng(0)
+    plain = [talk_size_sector(seed) for seed in range(ROTATION)]
+    return [replace(sector, surfel_snow=rng.uniform(0, 1, sector.surfel_count).astype(np.float32)) for sector in plain]
+
+
 def moving_suns() -> list[RelightInput]:
     """One moment's light after another, under a sun that never stands where it stood, and with snow."""
     day, given = daylight(), []
@@ -154,12 +161,7 @@ def bench_ticks(device: Device, rounds: int = 15) -> list[Measurement]:
     samples taken anew. Snow and lamps stay as they are; ``_flicker`` changes 16 lamps at every tick too, ``_settled`` nothing.
     ``relight_host`` makes the worst tick's calls for sectors of one probe and one brick: Python and driver.
     """
-    rng = np.random.default_rng(0)
-    sectors = [
-        replace(s, surfel_snow=rng.uniform(0, 1, s.surfel_count).astype(np.float32))
-        for s in (talk_size_sector(seed) for seed in range(ROTATION))
-    ]
-    ticks, tiny = Ticks(device, sectors), Ticks(device, [talk_size_sector(seed, 1, 1, 1 + SKY_PATCHES) for seed in range(ROTATION)])
+    ticks, tiny = Ticks(device, snowy_sectors()), Ticks(device, [talk_size_sector(seed, 1, 1, 1 + SKY_PATCHES) for seed in range(ROTATION)])
     for _ in range(ROTATION):
         ticks.flickering()
         tiny.everything()

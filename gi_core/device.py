@@ -54,8 +54,8 @@ class SharedKernel:
     pyopencl is told what the arguments are: left to find out, it raises and catches a C++ exception for each number, 12 us apiece.
     """
 
-    def __init__(self, queue: cl.CommandQueue, kernel: cl.Kernel) -> None:
-        self._queue = queue
+    def __init__(self, device: "Device", kernel: cl.Kernel) -> None:
+        self._device = device
         self._kernel = kernel
         self._knows_types = False
         self._lock = threading.Lock()
@@ -67,7 +67,9 @@ class SharedKernel:
             if not self._knows_types:
                 self._kernel.set_scalar_arg_dtypes([None if isinstance(given, cl.Buffer) else given.dtype for given in arguments])
                 self._knows_types = True
-            self._kernel(self._queue, size, group, *arguments)
+            event = self._kernel(self._device.queue, size, group, *arguments)
+        if self._device.launched is not None:
+            self._device.launched.append((self._kernel.function_name, event))
 
     def launch_1d(self, items: int, *arguments: Any) -> None:
         """Enqueue the kernel for some work-items, rounded up to whole work-groups of GROUP: kernels guard against the excess."""
@@ -77,12 +79,16 @@ class SharedKernel:
 class Device:
     """A device with an in-order queue, and the programs built for it so far."""
 
-    def __init__(self, name: str | None = None) -> None:
-        """``name`` is part of a device's description; SECTORLIGHT_DEVICE where it is None. Raises DeviceError."""
+    def __init__(self, name: str | None = None, timed: bool = False) -> None:
+        """``name`` is part of a device's description; SECTORLIGHT_DEVICE where it is None. Raises DeviceError.
+
+        timed : keep each launch of a shared kernel, by name, with an event that knows when it ran, in ``launched``
+        """
         self.device = choose_device(name or os.environ.get(ENVIRONMENT))
         self.name = describe(self.device)
         self.context = cl.Context([self.device])
-        self.queue = cl.CommandQueue(self.context)
+        self.queue = cl.CommandQueue(self.context, properties=cl.command_queue_properties.PROFILING_ENABLE if timed else 0)
+        self.launched: list[tuple[str, cl.Event]] | None = [] if timed else None
         self._programs: dict[tuple[str, tuple[tuple[str, int], ...]], cl.Program] = {}
         self._shared_kernels: dict[tuple[object, ...], SharedKernel] = {}
         try:
@@ -110,7 +116,7 @@ class Device:
         key = (name, *defines.items())
         found = self._shared_kernels.get(key)
         if found is None:
-            found = self._shared_kernels[key] = SharedKernel(self.queue, self.kernel(name, **defines))
+            found = self._shared_kernels[key] = SharedKernel(self, self.kernel(name, **defines))
         return found
 
     @property

@@ -37,8 +37,9 @@ SHADOW_END_M = 0.02
 # A surfel is looked up this far in front of its plane, in metres and in shares of its cell: its position is a mean of hits, which
 # where the surface bends lies below some of it.
 SHADOW_BIAS_M, SHADOW_BIAS_CELLS = 0.05, 0.05
-# A surfel's points that are looked up: 8 or 16.
-SHADOW_TAPS = 8
+# Points of a surfel's cell that are looked up in the shadow map, two texels each. Twice as many texels took half as long again, and the
+# error was 5 % less.
+SHADOW_TAPS = 4
 # Floats from one row of the map to the next: 64 bytes more than the 1024 texels, so that texels under one another do not all compete for
 # the same places of a cache.
 SHADOW_ROW_TEXELS = 1040

@@ -7,7 +7,9 @@ What changes seldom is worked out when it changes, and a pass only does what eve
     every pass      bounce_bricks, gather_probes
 """
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,10 +17,12 @@ import pyopencl as cl
 
 from gi_core import relight_twin
 from gi_core.arrays import AnyArray, Float32, UInt32
-from gi_core.device import Device
+from gi_core.device import Device, SharedKernel
 from gi_core.layout import BOUNCE
 from gi_core.relight_input import RelightInput
 from gi_core.sector import Sector, starts
+
+Launch = Callable[..., None]
 
 VOXEL_GROUP = (8, 4, 1)  # work-items of fill_volume.cl along x, y, z; see SharedKernel
 WEIGHTS_PER_VECTOR = 4
@@ -57,7 +61,7 @@ class ResidentSector:
         self.voxel_probe = device.upload(sector.voxel_probe)
         self.voxel_weight = device.upload(sector.voxel_weight)
         self.cubes = device.allocate(sector.probe_count * sector.basis_size * 16)
-        self.direct = device.allocate((sector.brick_count + sky_patches) * 16)
+        self.direct = device.allocate(sector.brick_count * 16)
         self.exitance = device.allocate((sector.brick_count + sky_patches) * 16)
         # None of these is there before something needs it.
         self.sun_visibility: cl.Buffer | None = None
@@ -71,6 +75,7 @@ class ResidentSector:
         self._light: LightOnDevice | None = None
         self._direct_of: object = None
         self._bounces_of: float | None = None
+        self._launches: dict[str, tuple[tuple[object, ...], Launch]] = {}
 
     @property
     def nbytes(self) -> int:
@@ -124,32 +129,30 @@ class ResidentSector:
             self._collect_bounces(snow)
             self._bounces_of = snow
         if self._direct_of != light.identity:
-            if light.lights is not None:
-                self._light_surfels(light)
-            self._light_bricks(light, snow)
+            count, shining = len(light.given.lights), [] if light.lights is None else [light.lights]
+            if shining:
+                self._prepared("sun_on_surfels", (count, self.sun_sample), partial(self._sun_on_surfels, count))(*shining)
+            about = (count, snow, self._lamps, self.sun_share)
+            self._prepared("light_bricks", about, partial(self._light_bricks, count, snow))(*shining)
             self._direct_of = light.identity
 
     def enqueue_pass(self) -> None:
         """Enqueue one pass: one more bounce on the cubes that the sector holds. ``light`` comes first."""
-        self._enqueue_pass(self.bounce_starts or self.direct, self.cubes)
-
-    def enqueue_first_bounce(self, cubes: cl.Buffer) -> None:
-        """Enqueue what one pass from darkness gives, into other cubes than the sector's own: sky and the first surface alone."""
-        self._enqueue_pass(self.device.allocate(4 * (self.sector.brick_count + 1)), cubes)  # no brick has a bounce
-
-    def _enqueue_pass(self, bounce_starts: cl.Buffer, cubes: cl.Buffer) -> None:
         sector, light = self.sector, self._light
         if sector.probe_count == 0:
             return
         assert light is not None
-        patches = len(light.given.patch_exitance)
-        arguments: list[Any] = [np.uint32(sector.brick_count), bounce_starts, self.bounces or self.direct, self.direct]
-        arguments += [self.cubes, np.uint32(patches), light.patches, self.exitance]
-        self.device.shared_kernel("bounce_bricks").launch_1d(sector.brick_count + patches, *arguments)
-        vectors = -(-sector.basis_size // WEIGHTS_PER_VECTOR)
-        kernel = self.device.shared_kernel("gather_probes", BASIS_SIZE=sector.basis_size, WEIGHT_VECTORS=vectors)
-        factors = (self.factor_starts, self.factor_source, self.factor_weight)
-        kernel.launch_1d(sector.probe_count, np.uint32(sector.probe_count), *factors, self.exitance, cubes)
+        self._prepared("bounce_bricks", (self.bounces,), self._bounce_bricks)(light.patches)
+        self._prepared("gather_probes", (), partial(self._gather_probes, self.cubes))()
+
+    def enqueue_first_bounce(self, cubes: cl.Buffer) -> None:
+        """Enqueue what one pass from darkness gives, into other cubes than the sector's own: sky and the first surface alone."""
+        if self.sector.probe_count == 0:
+            return
+        assert self._light is not None
+        no_bounces = self.device.allocate(4 * (self.sector.brick_count + 1))
+        self._bounce_bricks(no_bounces)(self._light.patches)
+        self._gather_probes(cubes)()
 
     def fill_volume(self, box: AnyArray, size: tuple[int, ...], target: cl.Buffer, cubes: cl.Buffer | None = None) -> None:
         """Enqueue this sector's part of a volume: ``box`` (1,) layout.VOLUME_BOX, its size (x, y, z), the volume's buffer.
@@ -174,21 +177,31 @@ class ResidentSector:
             padded[..., :3] = cubes
             cl.enqueue_copy(self.device.queue, self.cubes, padded)
 
-    def _light_surfels(self, light: LightOnDevice) -> None:
-        count = len(light.given.lights)
+    def _launch(self, kernel: SharedKernel, items: int, *arguments: Any) -> Launch:
+        """A launch that lacks no argument, or only the last ones."""
+        return partial(kernel.launch_1d, items, *arguments)
+
+    def _prepared(self, name: str, about: tuple[object, ...], make: Callable[[], Launch]) -> Launch:
+        """The launch that ``make`` made when this was last ``about`` the same: gathering arguments takes as long as a launch itself."""
+        known = self._launches.get(name)
+        if known is None or known[0] != about:
+            known = self._launches[name] = about, make()
+        return known[1]
+
+    def _sun_on_surfels(self, count: int) -> Launch:
+        """Lacks the lights."""
         if self.sun_visibility is None:
             self.sun_visibility = self.device.upload(self.sector.sun_visibility)
         if self.sun_share is None or self.sun_share.size < count * self._groups * SURFELS_PER_GROUP * 4:
             self.sun_share = self.device.allocate(count * self._groups * SURFELS_PER_GROUP * 4)
         kernel = self.device.shared_kernel("sun_on_surfels", DIRECTIONAL_LIGHTS=count, HAS_SUN_MAP=int(self.sun_sample is not None))
-        arguments: list[Any] = [np.uint32(self._groups), self.surfel_normal, self.sun_visibility]
-        arguments += [np.uint32(4 * self.sector.sun_visibility.shape[1]), light.lights]
-        if self.sun_sample is not None:
-            arguments.append(self.sun_sample)
-        kernel.launch_1d(self._groups, *arguments, self.sun_share)
+        sample = [] if self.sun_sample is None else [self.sun_sample]
+        plane_bytes = np.uint32(4 * self.sector.sun_visibility.shape[1])
+        surfels = (np.uint32(self._groups), self.surfel_normal, self.sun_visibility, plane_bytes)
+        return self._launch(kernel, self._groups, *surfels, *sample, self.sun_share)
 
-    def _light_bricks(self, light: LightOnDevice, snow: float) -> None:
-        count = len(light.given.lights)
+    def _light_bricks(self, count: int, snow: float) -> Launch:
+        """Lacks the lights, if there are any."""
         kernel = self.device.shared_kernel(
             "light_bricks",
             DIRECTIONAL_LIGHTS=count,
@@ -198,12 +211,27 @@ class ResidentSector:
         )
         arguments: list[Any] = [np.uint32(self.sector.brick_count), self.brick_starts, self.surfel_albedo]
         arguments += [buffer for buffer in (self.brick_emission, self._lamps) if buffer is not None]
-        if count:
-            arguments += [self.sun_share, np.uint32(self._groups * SURFELS_PER_GROUP), light.lights]
         arguments.append(self.direct)
         if snow > 0:
             arguments.append(np.float32(snow))
-        kernel.launch_1d(self.sector.brick_count, *arguments)
+        if count:
+            arguments += [self.sun_share, np.uint32(self._groups * SURFELS_PER_GROUP)]
+        return self._launch(kernel, self.sector.brick_count, *arguments)
+
+    def _bounce_bricks(self, bounce_starts: cl.Buffer | None = None) -> Launch:
+        """Lacks the sky patches."""
+        bricks, patches = self.sector.brick_count, self._sky_patches
+        bounces = (bounce_starts or self.bounce_starts or self.direct, self.bounces or self.direct)
+        kernel = self.device.shared_kernel("bounce_bricks")
+        counts = (np.uint32(bricks), np.uint32(patches))
+        return self._launch(kernel, bricks + patches, *counts, *bounces, self.direct, self.cubes, self.exitance)
+
+    def _gather_probes(self, cubes: cl.Buffer) -> Launch:
+        sector = self.sector
+        vectors = -(-sector.basis_size // WEIGHTS_PER_VECTOR)
+        kernel = self.device.shared_kernel("gather_probes", BASIS_SIZE=sector.basis_size, WEIGHT_VECTORS=vectors)
+        factors = (self.factor_starts, self.factor_source, self.factor_weight)
+        return self._launch(kernel, sector.probe_count, np.uint32(sector.probe_count), *factors, self.exitance, cubes)
 
     def _collect_bounces(self, snow: float) -> None:
         """Bounces of the sector under this much snow. Which there are does not depend on the snow: the first time counts them."""
@@ -224,7 +252,7 @@ class ResidentSector:
             surfels = [self.surfel_albedo, self.surfel_normal, np.uint32(self._groups * SURFELS_PER_GROUP)]
             bricks = np.uint32(sector.brick_count)
             written = (bounce_starts, bounces, count)
-            kernel.launch_1d(sector.brick_count, bricks, self.brick_starts, *surfels, probe, *weight, *written, *last)
+            self._launch(kernel, sector.brick_count, bricks, self.brick_starts, *surfels, probe, *weight, *written, *last)()
 
         if self.bounce_starts is None:
             most = 3 * sector.feedback_probe.shape[1]

@@ -8,9 +8,9 @@ from gi_core.shadow_plan import MAP_TEXELS, TEXELS_PER_METRE, ShadowPlan
 
 NOTHING_DRAWN = np.float32(-1e30)
 LEAST_COSINE = 0.01
-# Hammersley's points on the square -1..1: (SHADOW_TAPS, 2), across and down.
-TAPS = np.array([[i, int(f"{i:0{SHADOW_TAPS.bit_length() - 1}b}"[::-1], 2)] for i in range(SHADOW_TAPS)]) * 2 / SHADOW_TAPS
-TAPS += 1 / SHADOW_TAPS - 1
+# Across and down a cell, as shares of half its size: (SHADOW_TAPS, 2).
+TAPS = np.array([[-0.75, -0.75], [-0.25, 0.25], [0.25, -0.25], [0.75, 0.75]])
+assert len(TAPS) == SHADOW_TAPS
 
 
 def map_from_world(plan: ShadowPlan, points: AnyArray) -> AnyArray:
@@ -54,18 +54,21 @@ def sample(plan: ShadowPlan, depth: Float32, position: AnyArray, normal: Float32
     bias = SHADOW_BIAS_M + SHADOW_BIAS_CELLS * size
     middle = map_from_world(plan, position + bias[:, None] * normal)
     spread = size / 2 * TEXELS_PER_METRE
-    steep = np.maximum(1 - cosine**2, 1e-6)
+    # The cell seen from the sun is shortened along the direction in which it is slanted.
+    shorten = spread / (1 + cosine)
     lit: AnyArray = np.zeros(len(position), np.int32)
-    for tap in TAPS.astype(position.dtype):
-        a, b = tap[0] * spread, tap[1] * spread
-        slant = np.where(1 - cosine**2 > 1e-6, (a * across + b * down) * (1 - cosine) / steep, 0)
-        texel = np.floor(middle[:, :2] + np.stack([a - slant * across, b - slant * down], axis=1)).astype(int)
-        step = (texel + 0.5).astype(position.dtype) - middle[:, :2]
-        expected = middle[:, 2] - (step[:, 0] * across + step[:, 1] * down) / np.maximum(cosine, LEAST_COSINE) / TEXELS_PER_METRE
-        column, row = np.clip(texel, 0, MAP_TEXELS - 1).T
-        lit += expected >= depth[row, column]
+    for a, b in TAPS.astype(position.dtype):
+        aside = spread * a - (a * across + b * down) * across * shorten
+        below = spread * b - (a * across + b * down) * down * shorten
+        left = np.floor(middle[:, :2] + np.stack([aside - position.dtype.type(0.5), below], axis=1)).astype(int)
+        for texel in (left, left + np.array([1, 0])):
+            step = (texel + 0.5).astype(position.dtype) - middle[:, :2]
+            slope = step[:, 0] * across + step[:, 1] * down
+            expected = middle[:, 2] - slope / np.maximum(cosine, LEAST_COSINE) / TEXELS_PER_METRE
+            column, row = np.clip(texel, 0, MAP_TEXELS - 1).T
+            lit += expected >= depth[row, column]
     inside = ((middle[:, :2] - spread[:, None] >= 0) & (middle[:, :2] + spread[:, None] < MAP_TEXELS)).all(axis=1)
     valid = inside & (position[:, 1] + plan.reach_height_m >= top_m)
     away = cosine <= LEAST_COSINE
-    share = np.where(away, 0, (lit * WHOLE_SAMPLE + SHADOW_TAPS // 2) // SHADOW_TAPS)
+    share = np.where(away, 0, (lit * WHOLE_SAMPLE + SHADOW_TAPS) // (2 * SHADOW_TAPS))
     return share.astype(np.uint8), np.asarray(valid | away)

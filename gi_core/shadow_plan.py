@@ -15,8 +15,9 @@ from gi_core.layout import SHADOW_FRAME, SHADOW_TRIANGLE
 # 256 m across, so that all of a 100 m volume and the streets around it are inside; texels a quarter of a surfel's cell.
 MAP_TEXELS = 1024
 TEXELS_PER_METRE = 4.0
-# Geometry up to this far towards the sun is drawn [m]: beyond, a surfel's ray must be above the city or the baked visibility is used.
-MAX_REACH_M = 1500.0
+# Geometry up to this far towards the sun is drawn [m]: beyond, a surfel's ray must be above the city or the baked visibility is used. Far
+# enough for towers of 500 m and a sun at 5 degrees, whose baked visibility is the worst.
+MAX_REACH_M = 6000.0
 # The sun's disc is half a degree wide: a shadow's edge drawn this far off is still within its own penumbra.
 SUN_MOVED_DEGREES = 0.25
 BOX_MOVED_M = 0.5

@@ -11,13 +11,13 @@
 
 __kernel void bounce_bricks(
     const uint bricks,
+    const uint patches,
     __global const uint *bounce_starts,
     __global const Bounce *bounces,
     __global const float4 *direct,
     __global const float4 *probe_cube,
-    const uint patches,
-    __global const float4 *patch_exitance,
-    __global float4 *exitance)
+    __global float4 *exitance,
+    __global const float4 *patch_exitance)
 {
     const uint brick = get_global_id(0);
     if (brick >= bricks) {

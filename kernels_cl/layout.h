@@ -19,7 +19,7 @@
 #define SHADOW_END_M 0.02f
 #define SHADOW_BIAS_M 0.05f
 #define SHADOW_BIAS_CELLS 0.05f
-#define SHADOW_TAPS 8
+#define SHADOW_TAPS 4
 #define SHADOW_ROW_TEXELS 1040
 
 // How much of one row of the probes' cubes a brick sends on, per channel. row : ROW_ONE + probe * 6 + face.

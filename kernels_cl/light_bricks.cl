@@ -35,14 +35,14 @@ __kernel void light_bricks(
 #if HAS_LAMPS
     __global const float4 *surfel_light,
 #endif
-#if DIRECTIONAL_LIGHTS > 0
-    __global const float *sun_share,
-    const uint share_stride,
-    __constant const DirectionalLight *lights,
-#endif
     __global float4 *direct
 #if HAS_SNOW
     , const float snow
+#endif
+#if DIRECTIONAL_LIGHTS > 0
+    , __global const float *sun_share,
+    const uint share_stride,
+    __constant const DirectionalLight *lights
 #endif
 )
 {

@@ -8,18 +8,14 @@
 // when its ray to the sun is above the city's top (`top`, sector-local) by where the drawn geometry ends (`reach_height` higher up).
 // Where it has none, its last sample is kept while its map is not older than `oldest_map`; then baked visibility takes over.
 //
-// A surfel stands for a cell of some size, so SHADOW_TAPS points spread over the cell are looked up, each in the texel that it falls
-// into; the surfel's own plane is followed to that texel's centre, so that a slanted surface does not shade itself. The points are
-// Hammersley's: seen from either side of the cell no two lie behind one another, so a shadow's edge along it moves by 1 / SHADOW_TAPS.
+// A surfel stands for a cell of some size, so SHADOW_TAPS points spread over the cell are looked up, each in the two texels of a row that
+// are nearest to it; the surfel's own plane is followed to those texels' centres, so that a slanted surface does not shade itself. Two
+// neighbours are one read, and reads are what this kernel's time goes into. No tap lies in another's row or column:
 //
-//      . . . . . . . o
-//      . . . o . . . .      rows of the cell: the columns' numbers with their bits reversed
-//      . . . . . o . .
-//      . o . . . . . .
-//      . . . . . . o .
-//      . . o . . . . .
-//      . . . . o . . .
-//      o . . . . . . .
+//      . . . o
+//      . o . .
+//      . . o .
+//      o . . .
 //
 // Eight surfels at a time, as in sun_on_surfels.cl; arrays are padded to whole groups of eight. Global size: groups of eight surfels.
 #include "layout.h"
@@ -30,17 +26,12 @@
 #define LEAST_COSINE 0.01f
 
 // Where the taps lie across and down the cell, as shares of half its size.
-#define TAP(i, reversed) { (i + 0.5f) * (2.0f / SHADOW_TAPS) - 1.0f, (reversed + 0.5f) * (2.0f / SHADOW_TAPS) - 1.0f }
-#if SHADOW_TAPS == 8
-__constant const float taps[SHADOW_TAPS][2] = { TAP(0, 0), TAP(1, 4), TAP(2, 2), TAP(3, 6), TAP(4, 1), TAP(5, 5), TAP(6, 3), TAP(7, 7) };
-#elif SHADOW_TAPS == 16
-__constant const float taps[SHADOW_TAPS][2] = {
-    TAP(0, 0), TAP(1, 8), TAP(2, 4), TAP(3, 12), TAP(4, 2), TAP(5, 10), TAP(6, 6), TAP(7, 14),
-    TAP(8, 1), TAP(9, 9), TAP(10, 5), TAP(11, 13), TAP(12, 3), TAP(13, 11), TAP(14, 7), TAP(15, 15)
-};
-#else
-#error "SHADOW_TAPS must be 8 or 16"
-#endif
+__constant const float tap_across[SHADOW_TAPS] = { -0.75f, -0.25f, 0.25f, 0.75f };
+__constant const float tap_down[SHADOW_TAPS] = { -0.75f, 0.25f, -0.25f, 0.75f };
+
+// Two neighbouring texels.
+typedef long loose_pair_t __attribute__((aligned(4)));
+#define PAIR(at) (*(__global const loose_pair_t *)(map + (at)))
 
 inline int any_of(int8 yes)
 {
@@ -86,24 +77,31 @@ __kernel void sample_shadow_map(
             // The normal in the map's axes: the surfel's plane is n.x dx + n.y dy + n.z d(depth) = 0.
             const float8 across = nx * frame.across[0] + ny * frame.across[1] + nz * frame.across[2];
             const float8 down = nx * frame.down[0] + ny * frame.down[1] + nz * frame.down[2];
-            const float8 level = 1.0f - cosine * cosine;
-            const float8 shorten = level > 1e-6f ? (1.0f - cosine) / level : (float8)(0.0f);
+            // A tap at (a, b) of the cell lies at a * (to_x, turn) + b * (turn, to_y) from its middle.
+            const float8 shorten = spread / (1.0f + cosine);
+            const float8 to_x = spread - across * across * shorten, turn = -across * down * shorten;
+            const float8 to_y = spread - down * down * shorten;
             const float8 by_texel = -1.0f / (cosine * frame.texels_per_metre);
             const float8 by_column = across * by_texel, by_row = down * by_texel;
             const float8 depth_at_zero = depth + (0.5f - column) * by_column + (0.5f - row) * by_row;
             for (int i = 0; i < SHADOW_TAPS; ++i) {
-                const float8 a = taps[i][0] * spread, b = taps[i][1] * spread;
-                const float8 slant = (a * across + b * down) * shorten;
-                const int8 tap_column = TO_INTS(column + a - slant * across), tap_row = TO_INTS(row + b - slant * down);
+                const int8 tap_column = TO_INTS(column - 0.5f + tap_across[i] * to_x + tap_down[i] * turn);
+                const int8 tap_row = TO_INTS(row + tap_across[i] * turn + tap_down[i] * to_y);
                 const int8 at = (tap_row * SHADOW_ROW_TEXELS + tap_column) & covered;
-                const float8 over = (float8)(map[at.s0], map[at.s1], map[at.s2], map[at.s3], map[at.s4], map[at.s5], map[at.s6], map[at.s7]);
-                lit -= depth_at_zero + TO_FLOATS(tap_column) * by_column + TO_FLOATS(tap_row) * by_row >= over;
+                // In this order of lanes, taking pairs apart moves nothing from one half of a vector to the other.
+                const float8 p = as_float8((long4)(PAIR(at.s0), PAIR(at.s1), PAIR(at.s4), PAIR(at.s5)));
+                const float8 q = as_float8((long4)(PAIR(at.s2), PAIR(at.s3), PAIR(at.s6), PAIR(at.s7)));
+                const float8 left = (float8)(p.s0, p.s2, q.s0, q.s2, p.s4, p.s6, q.s4, q.s6);
+                const float8 right = (float8)(p.s1, p.s3, q.s1, q.s3, p.s5, p.s7, q.s5, q.s7);
+                const float8 own = depth_at_zero + TO_FLOATS(tap_column) * by_column + TO_FLOATS(tap_row) * by_row;
+                lit -= own >= left;
+                lit -= own + by_column >= right;
             }
         }
     }
     // The sun does not reach what faces away, whatever stands around.
     const int8 valid = covered | ~faces;
-    const int8 share = (lit * WHOLE_SAMPLE + SHADOW_TAPS / 2) / SHADOW_TAPS & faces;
+    const int8 share = (lit * WHOLE_SAMPLE + SHADOW_TAPS) / (2 * SHADOW_TAPS) & faces;
     const int8 last_number = TO_INTS(sampled_in[group]);
     const int8 last = last_number < (int)oldest_map ? (int8)(NO_SAMPLE) : TO_INTS(sun_sample[group]);
     sun_sample[group] = TO_UCHARS(valid ? share : last);

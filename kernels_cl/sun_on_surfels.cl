@@ -26,11 +26,11 @@ __kernel void sun_on_surfels(
     __global const float8 *normal, // x of all groups, then y, then z
     __global const uchar *sun_visibility,
     const uint plane_bytes,
-    __constant const DirectionalLight *lights,
 #if HAS_SUN_MAP
     __global const uchar8 *sun_sample,
 #endif
-    __global float8 *sun_share)
+    __global float8 *sun_share,
+    __constant const DirectionalLight *lights)
 {
     const uint group = get_global_id(0);
     if (group >= groups)
