@@ -4,7 +4,6 @@ VENV := .venv
 BIN := $(VENV)/bin
 DEMO_SOURCE ?= procedural:midtown?blocks=2x2&seed=1
 DEMO_DATA ?= demo_city
-DEMO_PLAYERS ?= demo_players.toml
 PORT ?= 8000
 
 .PHONY: help demo test test-all check lint-docker bench format clean
@@ -26,11 +25,11 @@ $(VENV)/.docker: $(VENV)/.ready
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev,docker]'
 	@touch $@
 
-demo: $(VENV)/.ready ## bake a small made-up city and serve it with a player walking (Ctrl-C stops the server)
+demo: $(VENV)/.ready ## bake a small procedural city and serve it, with somebody walking (Ctrl-C stops the server)
 	$(BIN)/sectorlight bake '$(DEMO_SOURCE)' -o $(DEMO_DATA)
-	@printf '[[player]]\nid = "walker"\n' > $(DEMO_PLAYERS)
+	@echo '[{"id": "walker"}]' > $(DEMO_DATA)_players.json
 	@echo "Open http://127.0.0.1:$(PORT)/ in a browser"
-	$(BIN)/sectorlight serve $(DEMO_DATA) --port $(PORT) --players $(DEMO_PLAYERS)
+	$(BIN)/sectorlight serve $(DEMO_DATA) --port $(PORT) --players $(DEMO_DATA)_players.json
 
 test: $(VENV)/.ready ## the tests, without the slow ones
 	$(BIN)/python -m pytest
@@ -56,4 +55,4 @@ format: $(VENV)/.ready ## rewrite the code in the project's format
 	$(BIN)/ruff check --fix .
 
 clean: ## remove the virtual environment and the demo's data
-	rm -rf $(VENV) $(DEMO_DATA) $(DEMO_PLAYERS)
+	rm -rf $(VENV) $(DEMO_DATA) $(DEMO_DATA)_players.json

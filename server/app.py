@@ -69,8 +69,8 @@ def app_of(service: Service) -> FastAPI:
     )
     app.state.service = service
     app.state.metrics = metrics = Metrics(service)
-    app.add_middleware(AnswerFromFinished, replies=service.replies)
     app.add_middleware(CountRequests, metrics=metrics)
+    app.add_middleware(AnswerFromFinished, replies=service.replies, count=metrics.count_request)
     app.add_middleware(HeadRequests)
     problems.install(app)
     stateless = (world, lighting, volume, distant, sectors, probes, preview)

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from gi_core.arrays import AnyArray, Float32, UInt8
+from gi_core.arrays import AnyArray, Float32, UInt8, UInt16
 
 ArrayFormat = Literal["npy", "raw"]
 RawEncoding = Literal["f16"]
@@ -16,6 +16,8 @@ RawEncoding = Literal["f16"]
 REPLY_VERSION = 2
 
 HALF_MAX = 65504.0
+_HALF_ONE = np.uint16(0x3C00)
+_LEAST_NORMAL_HALF = (127 - 14) << 23  # bits of the float32 2^-14
 MEDIA_TYPE: dict[ArrayFormat, str] = {"npy": "application/x-npy", "raw": "application/octet-stream"}
 
 
@@ -43,11 +45,26 @@ def half_texels(values: Float32, scale: float, alpha: UInt8 | None = None) -> by
 
     alpha : (...) uint8, broadcast against values[..., 0]: 0 or 1; 1 everywhere when it is None. GPUs have no three-channel 16-bit format.
     """
-    texels = np.ones((*values.shape[:-1], 4), "<f2")
-    texels[..., :3] = values / np.float32(scale)
-    if alpha is not None:
-        texels[..., 3] = alpha
+    texels = np.empty((*values.shape[:-1], 4), "<u2")
+    halves = _half_bits(np.asarray(values / np.float32(scale), np.float32))
+    for channel in range(3):  # three long loops instead of a loop of three at each texel
+        texels[..., channel] = halves[..., channel]
+    texels[..., 3] = _HALF_ONE if alpha is None else alpha * _HALF_ONE
     return texels.tobytes()
+
+
+def _half_bits(values: Float32) -> UInt16:
+    """Bits of the nearest halves, ties to even, as NumPy's own conversion gives them in five times the time. None may overflow."""
+    bits = values.view(np.uint32)
+    magnitude = bits & np.uint32(0x7FFFFFFF)
+    # The last bit kept decides ties; the carry of rounding up runs into the exponent, as it should.
+    rounded = magnitude + (np.uint32(0xFFF) + ((magnitude >> np.uint32(13)) & np.uint32(1)))
+    halves = ((rounded - np.uint32(112 << 23)) >> np.uint32(13)).astype(np.uint16)
+    halves |= (bits >> np.uint32(16)).astype(np.uint16) & np.uint16(0x8000)
+    tiny = magnitude < np.uint32(_LEAST_NORMAL_HALF)
+    if tiny.any():
+        halves[tiny] = values[tiny].astype(np.float16).view(np.uint16)
+    return halves
 
 
 def header_json(facts: Mapping[str, Any]) -> str:

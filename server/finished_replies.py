@@ -6,7 +6,7 @@ a request that was answered before, letter by letter, is then answered on the ev
 
 import threading
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -18,10 +18,9 @@ MAX_BYTES = 64 << 20  # some 80 raw volumes
 # Longer targets are somebody's experiment; remembering them would cost more than it saves.
 MAX_TARGET_BYTES = 512
 MAX_TARGETS = 4096
-# In a scope: a reply was sent that had been made before, so the path is one that a route has, letter by letter.
-IS_FINISHED = "sectorlight.is_finished"
 
 Target = tuple[str, bytes]
+Count = Callable[[str, str, int], None]
 
 
 @dataclass(frozen=True)
@@ -132,14 +131,17 @@ def target_of(scope: Scope) -> Target:
 class AnswerFromFinished:
     """Answers a GET that was answered before. Pure ASGI; everything else goes on to the application."""
 
-    def __init__(self, app: ASGIApp, replies: FinishedReplies) -> None:
+    def __init__(self, app: ASGIApp, replies: FinishedReplies, count: Count) -> None:
+        """``count`` is told method, path and status of each answer; the path is one that a route has, letter by letter."""
         self._app = app
         self._replies = replies
+        self._count = count
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         reply = self._replies.at(target_of(scope)) if scope["type"] == "http" and scope["method"] == "GET" else None
         if reply is None:
             await self._app(scope, receive, send)
         else:
-            scope[IS_FINISHED] = True
-            await reply.answer(Headers(scope=scope))(scope, receive, send)
+            answer = reply.answer(Headers(scope=scope))
+            self._count("GET", scope["path"], answer.status_code)
+            await answer(scope, receive, send)

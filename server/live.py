@@ -5,6 +5,7 @@ A server that only answers queries has no live world: no thread, no memory, no k
 
 import logging
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -58,6 +59,8 @@ class Live:
         self.kept = KeptEdits(options.state_file)
         self._state = self._starting_state()
         self._ticker: Ticker | None = None
+        self.walkers = ThreadPoolExecutor(1, thread_name_prefix="walker")
+        """Plans walks, which takes up to a second of reading and computing: one at a time, so that ticks and replies keep their share."""
         self._lock = threading.Lock()
         self._closed = False
 
@@ -108,6 +111,7 @@ class Live:
             ticker = self._ticker
         if ticker is not None:
             ticker.stop()
+        self.walkers.shutdown(cancel_futures=True)
 
     def _starting_state(self) -> LiveState:
         options, world = self.options, self.dataset.world

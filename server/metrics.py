@@ -2,18 +2,21 @@
 
 from collections.abc import Iterator
 
-from prometheus_client import CollectorRegistry, Counter, ProcessCollector, generate_latest
+from prometheus_client import CollectorRegistry, ProcessCollector, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
 from prometheus_client.registry import Collector
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from server.finished_replies import IS_FINISHED
 from server.service import Service
 from server.tick_stats import BUCKETS_S
 from server.ticker import Ticker
 
 # Clients may send any word as a method; each label is kept for ever.
 _METHODS = frozenset({"GET", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
+
+
+# Method, route, status.
+RequestKey = tuple[str, str, int]
 
 
 class Metrics:
@@ -23,17 +26,13 @@ class Metrics:
         self._registry = CollectorRegistry(auto_describe=False)
         self._registry.register(_ServiceFigures(service))
         ProcessCollector(registry=self._registry)
-        self._requests = Counter(
-            "sectorlight_http_requests", "Replies, by route and status.", ("method", "route", "status"), registry=self._registry
-        )
-        self._children: dict[tuple[str, str, int], Counter] = {}
+        self._requests: dict[RequestKey, int] = {}
+        self._registry.register(_RequestFigures(self._requests))
 
     def count_request(self, method: str, route: str, status: int) -> None:
-        """A reply was sent; ``route`` is a template, so that their number is bounded."""
+        """A reply was sent; ``route`` is a template, so that their number is bounded. On the event loop alone."""
         key = method if method in _METHODS else "other", route, status
-        if key not in self._children:
-            self._children[key] = self._requests.labels(*key)
-        self._children[key].inc()
+        self._requests[key] = self._requests.get(key, 0) + 1
 
     def text(self) -> bytes:
         """All figures in Prometheus' text format."""
@@ -41,7 +40,7 @@ class Metrics:
 
 
 class CountRequests:
-    """Counts HTTP replies. Pure ASGI; inside what turns HEAD into GET."""
+    """Counts HTTP replies. Pure ASGI; inside what turns HEAD into GET, and what answers from finished replies, which counts its own."""
 
     def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
         self._app = app
@@ -67,10 +66,21 @@ class CountRequests:
 
 def route_of(scope: Scope) -> str:
     """The template of the route that answered a request; ``unmatched`` where none did."""
-    if scope.get(IS_FINISHED):
-        return str(scope["path"])
     path = getattr(scope.get("route"), "path", None)
     return path if isinstance(path, str) and path else "unmatched"
+
+
+class _RequestFigures(Collector):
+    """Replies by what was asked and what came of it."""
+
+    def __init__(self, counts: dict[RequestKey, int]) -> None:
+        self._counts = counts
+
+    def collect(self) -> Iterator[Metric]:
+        found = CounterMetricFamily("sectorlight_http_requests", "Replies, by route and status.", labels=("method", "route", "status"))
+        for (method, route, status), count in sorted(self._counts.copy().items()):
+            found.add_metric((method, route, str(status)), count)
+        yield found
 
 
 class _ServiceFigures(Collector):

@@ -21,7 +21,7 @@ from server.service import Service
 from server.ticker import Ticker
 
 router = APIRouter(prefix="/v1/players", tags=["live world"])
-FIRST_FILL_S = 5.0
+FIRST_FILL_S = 3.0
 # Every tick may bring another one.
 CACHE_CONTROL = "no-cache"
 
@@ -70,4 +70,6 @@ async def _published(service: Service, ticker: Ticker, name: str) -> PublishedVo
         try:
             await asyncio.wait_for(service.ticks.after(service.ticks.latest.tick), max(left_s, 0.0))
         except TimeoutError as error:
+            if found is not None:  # the new player took over the old one's place and volume within one tick
+                return found
             raise LiveUnavailableError(f"player {name}: no volume yet; ask again in a moment") from error

@@ -59,7 +59,7 @@ async def add_player(
         player = player_from_json(body, "player", new_id=f"player-{secrets.token_hex(4)}", eye_height=live.lattice.eye_height)
         return live.walking(player, 0, kept)
 
-    entry = await asyncio.to_thread(walking)
+    entry = await asyncio.get_running_loop().run_in_executor(live.walkers, walking)
     applied = await apply(ticker, lambda state, tick: state.with_player(replace(entry, since_tick=tick)))
     await keep(service, kept)
     name = entry.player.id

@@ -192,8 +192,7 @@ def test_nothing_pops_when_a_sector_arrives_late(tmp_path, engine):
         run, light = Run(world), light_of(world, engine.lighting("12:00", "clear"))
         # The other sector comes first only if it is asked for first.
         run.until(at(STREET + EAST * 30), light, lambda r: SectorIndex(0, 0) in world.streamer.residents)
-        for _ in range(FADE_TICKS + 2):
-            run.tick(at(STREET), light)
+        run.until(at(STREET), light, lambda r: world.volumes["p0"].published is not None)
         before = world.volumes["p0"].published
         assert before.missing == (SectorIndex(-1, 0),)
         assert (before.values[:, :, :, :4] > 0).any()  # the placeholder, not darkness

@@ -3,7 +3,6 @@
 import contextlib
 import json
 import secrets
-import socket
 import sys
 import threading
 import time
@@ -20,7 +19,7 @@ from fastapi import FastAPI
 from gi_core.constants import VOXEL_SIZE_M
 from server.app import create_app
 from server.cli import main
-from server.cli_serve import http_server
+from server.cli_serve import bind, http_server
 from server.live import LiveOptions
 from server.settings import Settings
 
@@ -43,7 +42,7 @@ def city(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @contextlib.contextmanager
 def _serving(app: FastAPI) -> Iterator[httpx.Client]:
-    listener = socket.create_server(("127.0.0.1", 0))
+    listener = bind("127.0.0.1", 0)
     server = http_server(app, "critical")
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
     thread.start()

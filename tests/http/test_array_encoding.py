@@ -55,3 +55,16 @@ def test_header_json_is_one_ascii_line_and_refuses_nan() -> None:
     assert json.loads(line)["name"] == "Zürich\n"
     with pytest.raises(ValueError, match="JSON"):
         header_json({"valid": float("nan")})
+
+
+def test_halves_are_those_that_numpy_makes() -> None:
+    """Every finite half, what lies halfway to the next, and a little to both sides of that; and numbers of all sizes below."""
+    halves = np.arange(0x7C00, dtype=np.uint16).view(np.float16).astype(np.float32)
+    middles = (halves[:-1] + halves[1:]) / 2
+    around = np.concatenate([halves, middles, np.nextafter(middles, np.float32(0)), np.nextafter(middles, np.float32(1e9))])
+    sizes = np.exp2(np.random.default_rng(1).uniform(-140, 15.9, 100_000)).astype(np.float32)
+    values = np.concatenate([around, sizes, -around, -sizes, np.zeros(1, np.float32)])
+    values = values[: len(values) // 3 * 3].reshape(-1, 3)
+    texels = np.frombuffer(half_texels(values, 1.0), "<u2").reshape(-1, 4)
+    assert np.array_equal(texels[:, :3], values.astype(np.float16).view(np.uint16))
+    assert (texels[:, 3].view(np.float16) == 1).all()

@@ -253,11 +253,14 @@ def test_metrics_say_the_same(live_http: httpx.Client, player: str) -> None:
     live_http.get(f"/v1/players/{player}/volume")
     live_http.get("/v1/players/nobody")
     live_http.request("BREW", "/v1/clock")
+    for _ in range(3):  # the second and third are answered before any route is looked for
+        live_http.get("/v1/sky", params={"time": "07:17", "weather": "haze"})
     text = live_http.get("/metrics")
     assert text.headers["content-type"].startswith("text/plain")
     found = {line.rpartition(" ")[0]: float(line.rpartition(" ")[2]) for line in text.text.splitlines() if not line.startswith("#")}
     assert found['sectorlight_http_requests_total{method="GET",route="/v1/players/{id}",status="404"}'] >= 1
     assert found['sectorlight_http_requests_total{method="GET",route="/v1/players/{id}/volume",status="200"}'] >= 1
+    assert found['sectorlight_http_requests_total{method="GET",route="/v1/sky",status="200"}'] == 3
     assert not any("BREW" in name or "nobody" in name for name in found)
     assert found["sectorlight_live_running"] == 1
     assert found["sectorlight_players"] >= 1

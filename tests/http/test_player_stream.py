@@ -28,6 +28,8 @@ from server.stream_header import parse_header
 from server.volume_frames import Frame, VolumeDecoder, VolumeEncoder
 
 PATIENCE_S = 20.0
+# A text frame of a client, masked with zeros.
+ASK_FULL = b'\x81\x90\0\0\0\0{"type": "full"}'
 
 
 def until(found: Callable[[], Any]) -> Any:
@@ -195,12 +197,13 @@ def raw_stream(http: httpx.Client, player: str) -> socket.socket:
 def test_a_client_that_stops_reading_costs_a_message_and_holds_up_nobody(
     live_http: httpx.Client, player: str, racing: None, streams: PlayerStreams
 ) -> None:
-    with raw_stream(live_http, player):
+    with raw_stream(live_http, player) as deaf:
         # Full frames, as many as it can be sent: what the system buffers is soon full.
         stalled, since = -1, time.monotonic()
         deadline = since + PATIENCE_S
-        while time.monotonic() - since < 1.5:
+        while time.monotonic() - since < 1.0:
             assert time.monotonic() < deadline, "it was sent more and more"
+            deaf.sendall(ASK_FULL)
             if streams.counts.bytes != stalled:
                 stalled, since = streams.counts.bytes, time.monotonic()
             time.sleep(0.05)
@@ -255,17 +258,32 @@ def test_a_thousand_clients_come_and_go_without_a_trace(live_http: httpx.Client,
     come_and_go(live_http, player, streams, 1000)
 
 
-def test_a_server_that_stops_says_so(city: Any, serving: Any, wait_until_live: Any, street: tuple[float, ...]) -> None:
-    app = create_app(city, Settings(live=LiveOptions(ticks_per_second=10)))
+@pytest.mark.skipif(not hasattr(socket, "TCP_USER_TIMEOUT"), reason="the system has no such option")
+def test_a_client_that_takes_no_byte_is_cut_off_in_the_end(
+    city: Any, serving: Any, wait_until_live: Any, street: tuple[float, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("server.cli_serve.UNSENT_MS", 1000)
+    app = create_app(city, Settings(live=LiveOptions(ticks_per_second=20)))
     with serving(app) as http:
         wait_until_live(http)
         http.post("/v1/players", json={"id": "a", "path": [street], "speed": 0})
-        address = f"ws://{http.base_url.netloc.decode()}/v1/players/a/stream"
-        follower = Follower(connect(address, max_size=1 << 24, open_timeout=PATIENCE_S))
-        follower.next()
+        http.put("/v1/clock", json={"time": "09:00", "rate": 1200})
         deaf = raw_stream(http, "a")
-        stopping = time.monotonic()
-    assert follower.close_code() == 1001
-    assert time.monotonic() - stopping < 10
+        until(lambda: app.state.service.streams.clients == 1)
+        until(lambda: app.state.service.streams.clients == 0)
+        deaf.close()
+
+
+def test_a_server_that_stops_says_so(city: Any, serving: Any, wait_until_live: Any, street: tuple[float, ...]) -> None:
+    app = create_app(city, Settings(live=LiveOptions(ticks_per_second=10)))
+    with contextlib.ExitStack() as clients:
+        with serving(app) as http:
+            wait_until_live(http)
+            http.post("/v1/players", json={"id": "a", "path": [street], "speed": 0})
+            follower = clients.enter_context(following(http, "a"))
+            follower.next()
+            clients.enter_context(raw_stream(http, "a"))  # and one that does not hear it
+            stopping = time.monotonic()
+        assert time.monotonic() - stopping < 15
+        assert follower.close_code() == 1001
     assert app.state.service.live.started_ticker.is_stopped
-    deaf.close()

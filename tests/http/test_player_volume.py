@@ -20,7 +20,7 @@ def settled(live_http: httpx.Client, player: str) -> Iterator[str]:
     live_http.put("/v1/weather", json={"weather": SUNLESS})
     live_http.put("/v1/clock", json={"time": NOON, "paused": True})
     deadline, last, since = time.monotonic() + PATIENCE_S, "", time.monotonic()
-    while time.monotonic() - since < 1.5:
+    while time.monotonic() - since < 1.0:
         assert time.monotonic() < deadline, "the light did not settle"
         tick = live_http.get(f"/v1/players/{player}/volume", params={"mask": 1}).headers["gi-tick"]
         if tick != last:

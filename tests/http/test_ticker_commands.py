@@ -1,0 +1,108 @@
+"""Commands between ticks: in order, whole or not at all, and nobody else's are lost with one that fails or is given up."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from types import MappingProxyType, SimpleNamespace
+
+import pytest
+
+from gi_core.errors import InputError
+from gi_core.world import Lamp, Location
+from server.live_state import LiveLamp, LiveState, LiveUnavailableError, NoSuchThingError, authored_lamps
+from server.live_weather import fixed_weather
+from server.ticker import Ticker
+from server.world_clock import starting_clock
+
+
+class World:
+    """Stands in for a live world: notes where lamps were said to have changed."""
+
+    def __init__(self) -> None:
+        self.dataset = SimpleNamespace(world=SimpleNamespace(location=Location()))
+        self.touched: list[list[tuple[float, ...]]] = []
+
+    def lamps_moved(self, touched: list[tuple[object, float]]) -> None:
+        self.touched.append([tuple(position.tolist()) for position, _ in touched])
+
+    def close(self) -> None:
+        pass
+
+
+def lamp(name: str, x: float = 0.0) -> LiveLamp:
+    return LiveLamp(name, Lamp(name, "point", (x, 0.0, 0.0), 100.0))
+
+
+@pytest.fixture
+def ticker() -> Ticker:
+    lamps = {f"lamp{n}": lamp(f"lamp{n}", float(n)) for n in range(100)}
+    state = LiveState(starting_clock(Location(), "12:00"), fixed_weather("clear"), lamps=MappingProxyType(lamps))
+    return Ticker(World(), state)
+
+
+def jumping(by: int) -> Callable[[LiveState, int], LiveState]:
+    return lambda state, tick: replace(state, jumps=state.jumps * 10 + by)
+
+
+def test_commands_apply_in_order_and_name_their_tick(ticker: Ticker) -> None:
+    done = [ticker.apply(jumping(n)) for n in (1, 2, 3)]
+    ticker._apply_commands(7)
+    assert ticker.state.jumps == 123
+    assert [future.result(0) for future in done] == [7, 7, 7]
+
+
+def test_one_that_fails_changes_nothing_and_stops_no_other(ticker: Ticker) -> None:
+    before = ticker.state
+    missing = ticker.apply(lambda state, _: state.without_lamp("none"))
+    after = ticker.apply(jumping(1))
+    ticker._apply_commands(0)
+    with pytest.raises(NoSuchThingError):
+        missing.result(0)
+    assert after.result(0) == 0
+    assert ticker.state.lamps is before.lamps
+
+
+def test_one_that_was_given_up_is_left_out(ticker: Ticker) -> None:
+    """A request that is cancelled takes its future with it; the tick must not fail for that."""
+    given_up, after = ticker.apply(jumping(1)), ticker.apply(jumping(2))
+    assert given_up.cancel()
+    ticker._apply_commands(0)
+    assert ticker.state.jumps == 2
+    assert after.result(0) == 0
+
+
+def test_a_ticker_that_stops_refuses_what_is_left(ticker: Ticker) -> None:
+    waiting, given_up = ticker.apply(jumping(1)), ticker.apply(jumping(1))
+    given_up.cancel()
+    ticker.stop()
+    late = ticker.apply(jumping(1))
+    for future in (waiting, late):
+        with pytest.raises(LiveUnavailableError):
+            future.result(0)
+
+
+def test_only_lamps_that_changed_are_said_to_have(ticker: Ticker) -> None:
+    world = ticker.world
+    assert isinstance(world, World)
+    ticker.apply(lambda state, _: state.with_lamp(lamp("lamp3", 50.0), new=False))
+    ticker._apply_commands(0)
+    ticker.apply(lambda state, _: state.with_lamp(lamp("lamp3", 50.0), new=False))  # as it is already
+    ticker._apply_commands(1)
+    ticker.apply(lambda state, _: state.with_lamp(lamp("new", 60.0), new=True))
+    ticker._apply_commands(2)
+    ticker.apply(lambda state, _: state.without_lamp("new"))
+    ticker._apply_commands(3)
+    assert world.touched == [[(3.0, 0.0, 0.0), (50.0, 0.0, 0.0)], [], [(60.0, 0.0, 0.0)], [(60.0, 0.0, 0.0)]]
+
+
+def test_authored_lamps_have_distinct_ids_that_fit_into_paths() -> None:
+    names = ["block 0,0 street lamp 1", "block 0,0 street lamp 1", "", "lamp-1", "???", "a" * 100, "a" * 99]
+    found = authored_lamps(tuple(Lamp(name, "point", (float(n), 0.0, 0.0), 1.0) for n, name in enumerate(names)))
+    assert len(found) == len(names)
+    assert next(iter(found)) == "block-0-0-street-lamp-1"
+    assert all(len(name) <= 64 and name.replace("-", "").replace("_", "").isalnum() for name in found)
+    assert all(name == entry.id for name, entry in found.items())
+
+
+def test_a_lamp_that_is_there_is_no_new_one(ticker: Ticker) -> None:
+    with pytest.raises(InputError, match="PATCH"):
+        ticker.state.with_lamp(lamp("lamp1"), new=True)
