@@ -14,13 +14,14 @@ import pyopencl as cl
 
 from gi_core import relight_twin
 from gi_core.arrays import AnyArray, Float32, UInt32
+from gi_core.basis import FEEDBACK, basis_of_size, conversion
+from gi_core.constants import BASIS_SIZES
 from gi_core.device import Device, run_1d
 from gi_core.layout import BOUNCE
 from gi_core.relight_input import RelightInput
 from gi_core.sector import Sector, starts
 
 VOXEL_GROUP = (8, 4, 1)  # work-items of fill_volume.cl along x, y, z; see run_1d
-WEIGHTS_PER_VECTOR = 4
 SURFELS_PER_GROUP = 8  # of sun_on_surfels.cl: a byte of a plane's bits
 
 
@@ -49,10 +50,11 @@ class ResidentSector:
         normal[:, : sector.surfel_count] = sector.surfel_normal.T
         self.surfel_normal = device.upload(normal)
         self.brick_starts = device.upload(sector.brick_starts)
+        self.brick_basis = None if sector.basis_size == BASIS_SIZES["cube"] else device.upload(relight_twin.brick_basis(sector))
         self.brick_emission = None if sector.surfel_emission is None else device.upload(_brick_emission(sector))
         self.factor_starts = device.upload(sector.factor_starts)
         self.factor_source = device.upload(sector.factor_source)
-        self.factor_weight = device.upload(whole_vectors(sector.factor_weight))
+        self.factor_weight, self.factor_last = _upload_weights(device, sector.factor_weight)
         self.voxel_probe = device.upload(sector.voxel_probe)
         self.voxel_weight = device.upload(sector.voxel_weight)
         self.cubes = device.allocate(sector.probe_count * sector.basis_size * 16)
@@ -65,6 +67,8 @@ class ResidentSector:
         self.bounce_starts: cl.Buffer | None = None
         self.sun_sample: cl.Buffer | None = None
         self._lamps: cl.Buffer | None = None
+        self._converted: tuple[str, cl.Buffer, cl.Buffer] | None = None
+        self._is_cube = sector.basis_size == BASIS_SIZES["cube"]
         self._has_snow = bool(sector.surfel_snow.any())
         self._light: LightOnDevice | None = None
         self._direct_of: object = None
@@ -75,7 +79,8 @@ class ResidentSector:
     @property
     def nbytes(self) -> int:
         """Bytes on the device."""
-        return sum(value.size for value in vars(self).values() if isinstance(value, cl.Buffer))
+        own = sum(value.size for value in vars(self).values() if isinstance(value, cl.Buffer))
+        return own + (sum(buffer.size for buffer in self._converted[1:]) if self._converted else 0)
 
     def prepare(self) -> None:
         """Do now what the first light would wait for, should another thread have the time."""
@@ -133,13 +138,36 @@ class ResidentSector:
         if self.sector.probe_count:
             run_1d(self.device, self._gather("first", self.direct, cubes), self.sector.probe_count)
 
-    def fill_volume(self, box: AnyArray, size: tuple[int, ...], target: cl.Buffer, cubes: cl.Buffer | None = None) -> None:
+    def converted(self, basis: str, cubes: cl.Buffer | None = None) -> cl.Buffer:
+        """The sector's light, or other ``cubes`` of its probes, in a basis that is served: a buffer that the next call writes again.
+
+        Raises InputError for a basis that is richer than the sector's.
+        """
+        source = self.cubes if cubes is None else cubes
+        own, size = self.sector.basis_size, BASIS_SIZES[basis]
+        if own == size:
+            return source
+        rows = self.sector.probe_count * size
+        if self._converted is None or self._converted[0] != basis:
+            matrix = self.device.upload(conversion(basis_of_size(own), basis))
+            self._converted = basis, matrix, self.device.allocate(16 * rows)
+        _, matrix, target = self._converted
+        if rows:
+            kernel = self._kernel("convert_probes", FROM_SIZE=own, TO_SIZE=size)
+            kernel.set_args(np.uint32(rows), source, matrix, target)
+            run_1d(self.device, kernel, rows)
+        return target
+
+    def fill_volume(
+        self, box: AnyArray, size: tuple[int, ...], target: cl.Buffer, cubes: cl.Buffer | None = None, basis: str | None = None
+    ) -> None:
         """Enqueue this sector's part of a volume: ``box`` (1,) layout.VOLUME_BOX, its size (x, y, z), the volume's buffer.
 
-        ``cubes`` are shown in place of the sector's own.
+        ``cubes`` are shown in place of the sector's own; they, and the volume, are in ``basis`` where it is given.
         """
         sector = self.sector
-        kernel = self._kernel("fill_volume", BASIS_SIZE=sector.basis_size, VOXEL_PROBES=sector.voxel_probe.shape[3])
+        coefficients = sector.basis_size if basis is None else BASIS_SIZES[basis]
+        kernel = self._kernel("fill_volume", BASIS_SIZE=coefficients, VOXEL_PROBES=sector.voxel_probe.shape[3])
         kernel.set_args(box, self.voxel_probe, self.voxel_weight, self.cubes if cubes is None else cubes, target)
         whole = tuple(-(-count // group) * group for count, group in zip(size, VOXEL_GROUP, strict=True))
         cl.enqueue_nd_range_kernel(self.device.queue, kernel, whole, VOXEL_GROUP)
@@ -203,9 +231,11 @@ class ResidentSector:
         weighted = sector.feedback_probe.shape[1] > 1 or not (sector.feedback_weight == 1).all()
         kernel = self._kernel(
             "collect_bounces",
+            BASIS_SIZE=sector.basis_size,
             FEEDBACK_PROBES=sector.feedback_probe.shape[1],
             HAS_FEEDBACK_WEIGHTS=int(weighted),
             HAS_SNOW=int(snow > 0),
+            BOUNCE_ALBEDO_PERMILLE=round(1000 * FEEDBACK[basis_of_size(sector.basis_size)].albedo_max),
         )
         probe = device.upload(sector.feedback_probe)
         weight = [device.upload(sector.feedback_weight)] if weighted else []
@@ -213,14 +243,24 @@ class ResidentSector:
 
         def collect(bounce_starts: cl.Buffer, bounces: cl.Buffer) -> None:
             last = [np.float32(snow)] if snow > 0 else []
-            surfels = [self.surfel_albedo, self.surfel_normal, np.uint32(self._groups * SURFELS_PER_GROUP)]
+            normals = [self.surfel_normal, np.uint32(self._groups * SURFELS_PER_GROUP)] if self._is_cube else []
             kernel.set_args(
-                np.uint32(sector.brick_count), self.brick_starts, *surfels, probe, *weight, bounce_starts, bounces, count, *last
+                np.uint32(sector.brick_count),
+                self.brick_starts,
+                self.surfel_albedo,
+                *normals,
+                probe,
+                *weight,
+                bounce_starts,
+                bounces,
+                count,
+                *last,
             )
             run_1d(self.device, kernel, sector.brick_count)
 
         if self.bounce_starts is None:
-            most = 3 * sector.feedback_probe.shape[1]
+            # A surfel reads one face of the cube for each axis.
+            most = (3 if self._is_cube else 1) * sector.feedback_probe.shape[1]
             # Not zeroed: most of it is never touched, and so never takes memory.
             scratch = cl.Buffer(device.context, cl.mem_flags.READ_WRITE, most * sector.surfel_count * BOUNCE.dtype.itemsize)
             collect(device.upload(most * sector.brick_starts), scratch)
@@ -235,8 +275,10 @@ class ResidentSector:
         sector = self.sector
         bound: list[tuple[cl.Kernel, int]] = []
         if sector.probe_count and sector.brick_count:
-            kernel = self._kernel("bounce_bricks")
-            kernel.set_args(np.uint32(sector.brick_count), self.bounce_starts, self.bounces, self.direct, self.cubes, self.exitance)
+            kernel = self._kernel("bounce_bricks", BASIS_SIZE=sector.basis_size)
+            basis = [] if self.brick_basis is None else [self.brick_basis]
+            arguments = (self.bounce_starts, self.bounces, self.direct, self.cubes, *basis, self.exitance)
+            kernel.set_args(np.uint32(sector.brick_count), *arguments)
             bound.append((kernel, sector.brick_count))
         if sector.probe_count:
             bound.append((self._gather("pass", self.exitance, self.cubes), sector.probe_count))
@@ -245,12 +287,12 @@ class ResidentSector:
     def _gather(self, use: str, sources: cl.Buffer, cubes: cl.Buffer) -> cl.Kernel:
         """gather_probes.cl from other sources into other cubes: a kernel for each use, since arguments stay bound."""
         sector = self.sector
-        defines = {"BASIS_SIZE": sector.basis_size, "WEIGHT_VECTORS": -(-sector.basis_size // WEIGHTS_PER_VECTOR)}
         key = ("gather_probes", use)
         if key not in self._kernels:
-            self._kernels[key] = self.device.kernel("gather_probes", **defines)
+            self._kernels[key] = self.device.kernel("gather_probes", BASIS_SIZE=sector.basis_size)
         kernel = self._kernels[key]
-        kernel.set_args(np.uint32(sector.probe_count), self.factor_starts, self.factor_source, self.factor_weight, sources, cubes)
+        weights = [buffer for buffer in (self.factor_weight, self.factor_last) if buffer is not None]
+        kernel.set_args(np.uint32(sector.probe_count), self.factor_starts, self.factor_source, *weights, sources, cubes)
         return kernel
 
 
@@ -261,6 +303,8 @@ def _brick_emission(sector: Sector) -> Float32:
     return np.pad(np.float32(np.pi) * means, ((0, 0), (0, 1)))
 
 
-def whole_vectors(weights: Float32) -> Float32:
-    """Factor weights (F, B) padded with zeros to whole float4: (F, 4 n)."""
-    return np.pad(weights, ((0, 0), (0, -weights.shape[1] % WEIGHTS_PER_VECTOR)))
+def _upload_weights(device: Device, weights: Float32) -> tuple[cl.Buffer, cl.Buffer | None]:
+    """Factor weights (F, B) as gather_probes.cl takes them: whole vectors of 4 or 8 numbers, and the ninth apart where there is one."""
+    size = weights.shape[1]
+    vectors = np.pad(weights, ((0, 0), (0, 8 - size))) if 4 < size < 8 else weights[:, :8]
+    return device.upload(vectors), device.upload(weights[:, 8]) if size > 8 else None

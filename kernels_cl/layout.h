@@ -19,7 +19,7 @@
 #define SHADOW_BIAS_M 0.05f
 #define SHADOW_BIAS_CELLS 0.05f
 
-// How much of one row of the probes' cubes a brick sends on, per channel. row : ROW_ONE + probe * 6 + face.
+// How much of one row of the probes' light a brick sends on, per channel. row : ROW_ONE + probe * coefficients, and of the cube + face.
 typedef struct {
     float albedo[3];
     uint row;

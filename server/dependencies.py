@@ -62,7 +62,9 @@ class PositionQuery(LightingQuery):
 
 class VolumeQuery(PositionQuery):
     kind: Literal["outdoor"] = "outdoor"
-    basis: Literal["cube"] = "cube"
+    basis: Literal["cube", "sh1", "sh2"] = Field(
+        "cube", description="cube: +X -X +Y -Y +Z -Z; harmonics: 4 or 9 coefficients, where `/v1/world` says that they can be had"
+    )
     cascade: int = Field(0, ge=0, le=0, description="0: 32 x 16 x 32 voxels of 3.125 m")
     format: ArrayFormat = "npy"
     encoding: RawEncoding = Field("f16", description="of format=raw: RGBA half floats; lux = rgb x scale; alpha = 1 in free air, else 0")
