@@ -5,10 +5,13 @@
     near     volume voxels within 3.2 m of a surface               six-face irradiance at the voxel's centre
     mid      volume voxels 6 m or more from any surface            the same
     shaded   the volume, sampled as a client samples it            irradiance on the surface point itself
-    floor    exact cubes in place of the volume's, sampled alike   the same
+    floor    exact light in place of the volume's, sampled alike   the same
 
-``floor`` is what basis and voxel size cost when transport and interpolation are perfect: exact cubes at all open-air voxels, each
+``floor`` is what basis and voxel size cost when transport and interpolation are perfect: exact light at all open-air voxels, each
 other voxel filled from the nearest of them, as the server fills its solid ones.
+
+All is in the dataset's basis: of harmonics, what they say of the six faces is compared with what exact harmonics would say. Their
+dataset has two stages more, ``shaded_cube`` and ``floor_cube``: the same points when the cube is served instead.
 
 Of the dataset only the served light is believed. Points come from ``compare_points``; surroundings that a partial bake leaves out
 must be handed in as ``scene``, or the reference is lit through the gap.
@@ -24,10 +27,11 @@ import numpy as np
 from bake_jobs.compare_points import CLIENT_OFFSET_M, SectorPoints, choose_points, corner_voxels, nearest_open_voxel
 from bake_jobs.compare_report import StageSamples, summarise
 from bake_jobs.compare_states import DEFAULT_STATES, parse_states
-from bake_jobs.path_tracer import Estimate, PathTracer
+from bake_jobs.path_tracer import Estimate, PathTracer, Projector
 from bake_jobs.scene import Scene
 from gi_core.arrays import Float32, Float64, Int64
-from gi_core.constants import SECTOR_SIZE_M, VOLUME_SHAPE, VOXEL_NO_SECTOR, VOXEL_OUTDOORS
+from gi_core.basis import conversion, projection_weights
+from gi_core.constants import BASIS_SIZES, SECTOR_SIZE_M, VOLUME_SHAPE, VOXEL_NO_SECTOR, VOXEL_OUTDOORS
 from gi_core.dataset import Dataset
 from gi_core.engine import Engine
 from gi_core.errors import InputError
@@ -41,6 +45,7 @@ from gi_core.world import Lamp
 GEOMETRY_REACH_M = 1024.0
 DEFAULT_SECTORS = 9
 STAGES = ("probes", "near", "mid", "shaded", "floor")
+CUBE_STAGES = ("shaded_cube", "floor_cube")
 Progress = Callable[[int, int, str], None]
 
 
@@ -53,10 +58,23 @@ class Reference:
     lamps: tuple[Lamp, ...]
     samples: int
     rng: np.random.Generator
+    basis: str = "cube"
 
     def cubes(self, points: Float64) -> Estimate:
-        """(n, 3) [m] -> Estimate of (n, 6, 3) [lx]."""
-        return self.tracer.cube_irradiance(points, self.lighting, self.lamps, samples=self.samples, seed=self._seed())
+        """(n, 3) [m] -> Estimate of (n, 6, 3) [lx]: the six faces as the dataset's basis has them."""
+        return self._projected(points, lambda directions: projection_weights(self.basis, directions) @ conversion(self.basis, "cube").T)
+
+    def exact(self, points: Float64, bases: tuple[str, ...]) -> list[Estimate]:
+        """(n, 3) [m] -> Estimate of (n, B, 3) [lx] in each basis, from the same paths."""
+        ends = np.cumsum([BASIS_SIZES[basis] for basis in bases])[:-1].tolist()
+        if bases == ("cube",):
+            return [self.cubes(points)]
+        found = self._projected(points, lambda d: np.concatenate([projection_weights(basis, d) for basis in bases], axis=1))
+        parts = (np.split(values, ends, axis=1) for values in (found.mean, found.standard_error))
+        return [Estimate(mean, noise) for mean, noise in zip(*parts, strict=True)]
+
+    def _projected(self, points: Float64, project: Projector) -> Estimate:
+        return self.tracer.projected_irradiance(points, self.lighting, self.lamps, project, samples=self.samples, seed=self._seed())
 
     def surfaces(self, points: Float64, normals: Float64) -> Estimate:
         """(n, 3) [m] and unit normals -> Estimate of (n, 3) [lx]."""
@@ -101,15 +119,15 @@ def compare_dataset(
         raise InputError(f"compare: expected at least 1 point per sector, got {points_per_sector}")
     dataset = Dataset.open(dataset_path)
     world = dataset.world
-    if world.basis != "cube":
-        raise InputError(f"{dataset_path}: basis {world.basis!r}; compare knows 'cube'")
     moments = parse_states(states, world.location)
     chosen = list(sectors) if sectors is not None else choose_sectors(dataset, seed)
     engine = Engine(dataset, device)
     engine.lamps = world.lamps if lamps is None else tuple(lamps)
     lightings = {state.name: engine.lighting(state.time, state.weather) for state in moments}
     tracer = _tracer(dataset, chosen, scene)
-    found = {state: {stage: StageSamples() for stage in STAGES} for state in lightings}
+    bases = (world.basis,) if world.basis == "cube" else (world.basis, "cube")
+    all_stages = STAGES if len(bases) == 1 else STAGES + CUBE_STAGES
+    found = {state: {stage: StageSamples() for stage in all_stages} for state in lightings}
     air = {"open": 0, "called_solid": 0}
 
     for number, index in enumerate(chosen):
@@ -121,11 +139,15 @@ def compare_dataset(
                 air["open"] += int(known.sum())
                 air["called_solid"] += int((known & (volume.mask < VOXEL_OUTDOORS)).sum())
             stages = found[state]
-            reference = Reference(tracer, lighting, lamps_on(engine.lamps, lighting), samples, _rng(seed, index, lighting.digest))
-            stages["probes"].add(engine.lit_sector(index, lighting)[points.probe], reference.cubes(points.probe_position))
+            reference = Reference(
+                tracer, lighting, lamps_on(engine.lamps, lighting), samples, _rng(seed, index, lighting.digest), world.basis
+            )
+            lit = engine.lit_sector(index, lighting)[points.probe]
+            stages["probes"].add(_six_faces(lit, world.basis), reference.cubes(points.probe_position))
             _compare_voxels(stages["near"], volume, points.near, reference)
             _compare_voxels(stages["mid"], volume, points.mid, reference)
-            _compare_surfaces(stages["shaded"], stages["floor"], volume, points, reference)
+            served = [volume, *(engine.volume(points.eye, lighting, basis=basis) for basis in bases[1:])]
+            _compare_surfaces([(stages[a], stages[b]) for a, b in (STAGES[3:], CUBE_STAGES)[: len(bases)]], served, points, reference)
             if progress is not None:
                 progress(number * len(lightings) + place + 1, len(chosen) * len(lightings), f"sector {index.x},{index.z} {state}")
     if not any(samples.count for stages in found.values() for samples in stages.values()):
@@ -133,7 +155,7 @@ def compare_dataset(
     return {
         "preset": world.preset,
         "basis": world.basis,
-        "states": {state: {stage: summarise(stages[stage]) for stage in STAGES} for state, stages in found.items()},
+        "states": {state: {stage: summarise(stages[stage]) for stage in all_stages} for state, stages in found.items()},
         "moments": {state.name: {"time": lightings[state.name].time, "weather": state.weather} for state in moments},
         "lamps_on": {state: len(lamps_on(engine.lamps, lighting)) for state, lighting in lightings.items()},
         "sectors": [[index.x, index.z] for index in chosen],
@@ -186,27 +208,38 @@ def _rng(seed: int, index: SectorIndex, digest: str = "") -> np.random.Generator
 def _compare_voxels(samples: StageSamples, volume: Volume, voxels: Int64, reference: Reference) -> None:
     y, z, x = voxels[volume.mask[tuple(voxels.T)] != VOXEL_NO_SECTOR].T
     centre = voxel_centre(np.stack([x, y, z], axis=1) + volume.first_voxel)
-    samples.add(volume.values[:, y, z, x].transpose(1, 0, 2), reference.cubes(centre))
+    samples.add(_six_faces(volume.values[:, y, z, x].transpose(1, 0, 2), reference.basis), reference.cubes(centre))
 
 
-def _compare_surfaces(shaded: StageSamples, floor: StageSamples, volume: Volume, points: SectorPoints, reference: Reference) -> None:
-    """Both stages on surfaces share their reference."""
+def _six_faces(light: Float32, basis: str) -> Float32:
+    """What coefficients (n, B, 3) [lx] say of the six faces, as they are: (n, 6, 3)."""
+    return light if basis == "cube" else np.asarray(np.einsum("fb,nbc->nfc", conversion(basis, "cube"), light))
+
+
+def _compare_surfaces(
+    stages: list[tuple[StageSamples, StageSamples]], served: list[Volume], points: SectorPoints, reference: Reference
+) -> None:
+    """Shaded and floor, of the volume in each basis that it is served in. All stages on surfaces share their reference."""
     normal = points.normal.astype(np.float32)
+    volume = served[0]
 
     def as_client(values: Float32) -> Float32:
         return sample_volume(values, volume.origin, volume.voxel_size, points.surface, normal)
 
     truth = reference.surfaces(points.surface, points.normal)
-    shaded.add(as_client(volume.values), truth)
+    for (shaded, _), found in zip(stages, served, strict=True):
+        shaded.add(as_client(found.values), truth)
     if not points.open_voxel.any():
         return
     corner = corner_voxels(points.surface + CLIENT_OFFSET_M * points.normal, volume.origin).reshape(-1, 3)
     y, z, x = np.unique(corner, axis=0).T
     source = nearest_open_voxel(points.open_voxel)[:, y, z, x].T
     needed, which = np.unique(source, axis=0, return_inverse=True)
-    exact = reference.cubes(voxel_centre(needed[:, [2, 0, 1]] + volume.first_voxel))
-    values, noise = np.zeros((2, 6, *VOLUME_SHAPE, 3), np.float32)
-    values[:, y, z, x] = exact.mean[which.reshape(-1)].transpose(1, 0, 2)
-    noise[:, y, z, x] = exact.standard_error[which.reshape(-1)].transpose(1, 0, 2)
-    # Corners' errors are independent, so their weighted sum overstates the noise: an upper bound.
-    floor.add(as_client(values), Estimate(truth.mean, np.hypot(truth.standard_error, as_client(noise))))
+    of_corner = which.reshape(-1)
+    bases = tuple(found.basis for found in served)
+    for (_, floor), exact in zip(stages, reference.exact(voxel_centre(needed[:, [2, 0, 1]] + volume.first_voxel), bases), strict=True):
+        values, noise = np.zeros((2, exact.mean.shape[1], *VOLUME_SHAPE, 3), np.float32)
+        values[:, y, z, x] = exact.mean[of_corner].transpose(1, 0, 2)
+        noise[:, y, z, x] = exact.standard_error[of_corner].transpose(1, 0, 2)
+        # Corners' errors are independent, so their weighted sum overstates the noise: an upper bound. Harmonics' are not of one sign.
+        floor.add(as_client(values), Estimate(truth.mean, np.hypot(truth.standard_error, np.abs(as_client(noise)))))

@@ -3,9 +3,10 @@
 from dataclasses import asdict, dataclass
 from typing import Any, Literal, get_args
 
+from gi_core.constants import CUBE_FACES
 from gi_core.errors import InputError
 
-Preset = Literal["draft", "talk"]
+Preset = Literal["draft", "talk", "standard"]
 PRESETS: tuple[str, ...] = get_args(Preset)
 
 
@@ -13,6 +14,10 @@ PRESETS: tuple[str, ...] = get_args(Preset)
 class BakeSettings:
     """Knobs of a bake. "More" says what a larger value buys, after the unit.
 
+    basis : of the probes' light, cube, sh1 or sh2 (gi_core.basis); sh2: right for facades at any angle, half as many bytes again as the
+        cube
+    sky : faces, the talk's six scalars a probe, or patches, sources like any brick: right for a sky that is not uniform
+    sky_patches : of sky="patches"; more: a sharper sky, more factors
     rays_per_face_edge : rays along an edge of a probe's cube map face; more: smoother factors, slower bake
     grid_spacing_m [m] : ray-cast grid of probes; less: more probes
     probe_height_m [m] : probes stand this high above what the grid's ray hit
@@ -26,12 +31,13 @@ class BakeSettings:
     sun_declination_step_degrees, sun_hour_step_degrees : spacing of the baked sun directions; less: sharper shadows, larger files
     voxel_probes : probes that a voxel blends at most
     voxel_candidates : nearest probes that are tested for visibility from a voxel
-    feedback_probes : probes that light a surfel
+    feedback_probes : probes that light a surfel, the closest of those that see it; more: smoother bounces, more to do at each relight
     """
 
     preset: str = "talk"
     basis: str = "cube"
     sky: str = "faces"
+    sky_patches: int = 32
     rays_per_face_edge: int = 16
     grid_spacing_m: float = 4.0
     probe_height_m: float = 1.5
@@ -47,9 +53,17 @@ class BakeSettings:
     voxel_candidates: int = 8
     feedback_probes: int = 1
 
+    @property
+    def sky_sources(self) -> int:
+        """Sources that factors of the sky may read."""
+        return len(CUBE_FACES) if self.sky == "faces" else self.sky_patches
+
     def to_json(self) -> dict[str, Any]:
-        """The knobs as a JSON object."""
-        return asdict(self)
+        """The knobs as a JSON object; those that do nothing here are left out."""
+        knobs = asdict(self)
+        if self.sky == "faces":
+            del knobs["sky_patches"]
+        return knobs
 
 
 def settings_for(preset: str) -> BakeSettings:
@@ -66,4 +80,6 @@ def settings_for(preset: str) -> BakeSettings:
             sun_declination_step_degrees=16.0,
             sun_hour_step_degrees=15.0,
         )
+    if preset == "standard":
+        return BakeSettings(preset="standard", basis="sh2", sky="patches", feedback_probes=6)
     raise InputError(f"quality {preset!r}: expected one of {', '.join(PRESETS)}")

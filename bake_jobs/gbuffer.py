@@ -7,21 +7,24 @@ import numpy as np
 from bake_jobs.rays import Hits, RayScene
 from gi_core.ambient_cube import FACE_DIRECTIONS
 from gi_core.arrays import Float32, Float64
+from gi_core.basis import projection_weights
 
 
 @dataclass(frozen=True, eq=False)
 class RayPattern:
-    """Directions that every probe looks along, and what each contributes to the cube's faces.
+    """Directions that every probe looks along, and what exitance 1 from each adds to the coefficients of the probe's irradiance.
 
     direction : (r, 3) float32, unit, world frame
-    weight : (r, 6) float32, form factors: each column sums to 1
+    face_weight : (r, 6) float32, form factors of the cube's faces: each column sums to 1
+    weight : (r, B) float32, of the bake's basis
     """
 
     direction: Float32
+    face_weight: Float32
     weight: Float32
 
 
-def cube_map_pattern(edge: int) -> RayPattern:
+def cube_map_pattern(edge: int, basis: str = "cube") -> RayPattern:
     """Texel centres of a cube map with ``edge`` x ``edge`` texels per face."""
     t = (np.arange(edge) + 0.5) / edge * 2 - 1
     v, u = (a.ravel() for a in np.meshgrid(t, t, indexing="ij"))
@@ -33,7 +36,11 @@ def cube_map_pattern(edge: int) -> RayPattern:
     solid_angle = distance**-3
     weight = np.maximum(direction @ FACE_DIRECTIONS.T.astype(np.float64), 0) * solid_angle[:, None]
     weight /= weight.sum(axis=0)
-    return RayPattern(direction.astype(np.float32), weight.astype(np.float32))
+    face_weight = weight.astype(np.float32)
+    if basis != "cube":
+        # The texels' solid angles sum to 4 pi exactly, so that a uniform world gives uniform light whatever ``edge`` is.
+        weight = projection_weights(basis, direction) * (4 * solid_angle / solid_angle.sum())[:, None]
+    return RayPattern(direction.astype(np.float32), face_weight, weight.astype(np.float32))
 
 
 @dataclass(frozen=True, eq=False)

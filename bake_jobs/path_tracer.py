@@ -20,14 +20,15 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
-from bake_jobs.irradiance_basis import cube_weights, sh2_weights
 from bake_jobs.lamp_sampling import LampSampler
 from bake_jobs.rays import SURFACE_OFFSET_M, RayScene
 from bake_jobs.snow import snow_attribute
 from gi_core.arrays import AnyArray, Float32, Float64, Int32
+from gi_core.basis import projection_weights
 from gi_core.constants import SKY_SHAPE
 from gi_core.errors import InputError
 from gi_core.lighting import Lighting
@@ -45,7 +46,7 @@ ROULETTE_SURVIVAL_MAX = 0.95
 LAMP_DRAWS = 4
 GOLDEN_RATIO_FRACTION = (np.sqrt(5.0) - 1.0) / 2.0
 
-Projector = Callable[[Float32], Float32]
+Projector = Callable[[Float32], AnyArray]
 Lamps = Sequence[Lamp]
 
 
@@ -94,7 +95,8 @@ class PathTracer:
 
         Every path serves the three faces that look its way: directions are uniform over the sphere.
         """
-        return self._at_points(points, lighting, lamps, cube_weights, samples, replicates, seed)
+        project = partial(projection_weights, "cube")
+        return self.projected_irradiance(points, lighting, lamps, project, samples=samples, replicates=replicates, seed=seed)
 
     def sh2_irradiance(
         self, points: Float64, lighting: Lighting, lamps: Lamps = (), *, samples: int = 1024, replicates: int = 8, seed: int = 0
@@ -103,7 +105,8 @@ class PathTracer:
 
         Order 1, y, z, x, xy, yz, 3 z^2 - 1, xz, x^2 - y^2; the cosine convolution is included (Ramamoorthi and Hanrahan 2001).
         """
-        return self._at_points(points, lighting, lamps, sh2_weights, samples, replicates, seed)
+        project = partial(projection_weights, "sh2")
+        return self.projected_irradiance(points, lighting, lamps, project, samples=samples, replicates=replicates, seed=seed)
 
     def surface_irradiance(
         self,
@@ -125,9 +128,21 @@ class PathTracer:
         estimate = self._estimate(origin, normal.astype(np.float32), lighting, lamps, None, samples, replicates, seed)
         return Estimate(estimate.mean[:, 0], estimate.standard_error[:, 0])
 
-    def _at_points(
-        self, points: Float64, lighting: Lighting, lamps: Lamps, project: Projector, samples: int, replicates: int, seed: int
+    def projected_irradiance(
+        self,
+        points: Float64,
+        lighting: Lighting,
+        lamps: Lamps,
+        project: Projector,
+        *,
+        samples: int = 1024,
+        replicates: int = 8,
+        seed: int = 0,
     ) -> Estimate:
+        """Whatever is linear in the light at points in air: (n, 3) [m] -> Estimate of (n, K, 3).
+
+        project : unit directions (m, 3) -> (m, K), what radiance 1 [cd m^-2] from each adds, per solid angle [sr]
+        """
         return self._estimate(np.asarray(points, np.float64), None, lighting, lamps, project, samples, replicates, seed)
 
     def _estimate(

@@ -28,7 +28,7 @@ from bake_jobs.config import BakeSettings, settings_for
 from bake_jobs.geometry_clip import SectorCutter
 from bake_jobs.scene import Scene, scene_digest
 from bake_jobs.scene_source import load_scene
-from bake_jobs.sector_job import SKY_FACES, SectorBaker
+from bake_jobs.sector_job import SectorBaker
 from bake_jobs.summary import print_summary
 from gi_core import distant_file, geometry_file, sector_file
 from gi_core.container import write_atomic
@@ -140,7 +140,8 @@ def bake(
         bounds=scene.bounds,
         preset=settings.preset,
         basis=settings.basis,
-        sky_patches=SKY_FACES,
+        sky=settings.sky,
+        sky_patches=settings.sky_sources,
         settings=settings.to_json(),
         seed=seed,
         sun_table=table,

@@ -18,8 +18,6 @@ from gi_core.geometry_file import Geometry
 from gi_core.grid import SectorIndex
 from gi_core.sector import PROBE_IN_MARGIN, Sector
 
-SKY_FACES = 6  # sky="faces": the talk's six scalars, one patch for each cube face
-
 
 @dataclass(frozen=True, eq=False)
 class BakedSector:
@@ -43,13 +41,14 @@ class SectorBaker:
         self._rays = RayScene(scene.vertices, scene.triangles)
         self._solids = Solids(scene.vertices, scene.triangles)
         self._cutter = SectorCutter(scene)
-        self._pattern = gbuffer.cube_map_pattern(settings.rays_per_face_edge)
+        self._pattern = gbuffer.cube_map_pattern(settings.rays_per_face_edge, settings.basis)
 
     def bake(self, index: SectorIndex) -> BakedSector:
         """Both files of one sector."""
         geometry = self._cutter.cut(index)
         sector, meta = self.bake_arrays(index, geometry)
-        return BakedSector(index, sector_file.encode(sector, meta, SKY_FACES), geometry_file.encode(index, geometry, self._bake_id), meta)
+        sector_bytes = sector_file.encode(sector, meta, self._settings.sky_sources)
+        return BakedSector(index, sector_bytes, geometry_file.encode(index, geometry, self._bake_id), meta)
 
     def bake_arrays(self, index: SectorIndex, geometry: Geometry) -> tuple[Sector, dict[str, Any]]:
         """One sector's arrays before quantisation, and its meta. ``geometry`` is what SectorCutter.cut gives for it."""
@@ -58,7 +57,7 @@ class SectorBaker:
         seen = gbuffer.render(rays, placed.position, self._pattern)
         room = surfels.rooms_of_hits(seen, placed.room, scene.rooms)
         clustered = surfels.cluster(seen, room, index.origin, scene.albedo, scene.emission, settings.cells_double_beyond_m)
-        weights = factors.gather(seen, self._pattern, clustered)
+        weights = factors.gather(seen, self._pattern, clustered, None if settings.sky == "faces" else settings.sky_patches)
         feedback_probe, feedback_weight = surfels.feedback(clustered, seen, settings.feedback_probes)
         heights = geometry.vertices[:, 1] if len(geometry.vertices) else np.zeros(1)
         lattice = voxels.bake_voxels(rays, self._solids, np.array([heights.min(), heights.max()]), index, placed, settings, scene.rooms)

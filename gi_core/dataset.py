@@ -14,7 +14,7 @@ import numpy as np
 from gi_core import container, distant_file, geometry_file, sector_file
 from gi_core.arrays import Float64
 from gi_core.clock_time import time_zone
-from gi_core.constants import CUBE_FACES
+from gi_core.constants import BASIS_SIZES, CUBE_FACES, MAX_SKY_PATCHES
 from gi_core.distant_file import DistantTexels
 from gi_core.errors import CorruptFileError, FormatVersionError, InputError, SectorMissingError
 from gi_core.geometry_file import Geometry
@@ -22,11 +22,13 @@ from gi_core.grid import SectorIndex
 from gi_core.json_fields import Fields, all_finite
 from gi_core.lights import MAX_LUMENS, check_lamp
 from gi_core.sector import Sector
+from gi_core.sky_patches import MIN_PATCHES, SKY_SCHEMES
 from gi_core.sun_table import SunTable
 from gi_core.world import LAMP_KINDS, Lamp, Location, Room
 
 FORMAT = "sectorlight-dataset"
-VERSION = 1
+# Version 1 knew the ambient cube under six sky scalars alone; a bake of that kind still has it, so that older programs read it.
+VERSION, CUBE_VERSION = 2, 1
 WORLD_FILE = "world.json"
 DISTANT_FILE = "distant.gidist"
 MAX_WORLD_BYTES = 1 << 28
@@ -37,7 +39,6 @@ MAX_SECTOR_COORDINATE = 1_000_000
 # Room numbers have 16 bits, and 0 is outdoors.
 MAX_ROOMS = 65_535
 MAX_LAMPS = 1 << 20
-BASES = ("cube",)
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,7 @@ class WorldInfo:
 
     bounds : (2, 3) float64 [m], world frame: minimum and maximum of the geometry
     sectors : facts of each baked sector
+    sky : scheme of the sky patches, one of sky_patches.SKY_SCHEMES
     settings : the bake's knobs; preset, basis and sky patches are among what readers need of them
     error_report : what ``compare`` measured, or None
     """
@@ -75,6 +77,7 @@ class WorldInfo:
     bounds: Float64
     preset: str
     basis: str
+    sky: str
     sky_patches: int
     settings: dict[str, Any]
     seed: int
@@ -91,11 +94,17 @@ class WorldInfo:
         names = [name for name in SectorFacts.__dataclass_fields__ if name != "digest"]
         return {"sectors": len(self.sectors)} | {name: sum(getattr(f, name) for f in self.sectors.values()) for name in names}
 
+    @property
+    def version(self) -> int:
+        """The lowest format version of world.json that can say this."""
+        return CUBE_VERSION if (self.basis, self.sky) == ("cube", "faces") else VERSION
+
     def to_json(self) -> dict[str, Any]:
         """The object that world.json holds."""
-        return {
+        described = {"sky": self.sky} if self.version == VERSION else {}
+        return described | {
             "format": FORMAT,
-            "version": VERSION,
+            "version": self.version,
             "name": self.name,
             "source": self.source,
             "bake_id": self.bake_id,
@@ -126,11 +135,12 @@ class WorldInfo:
         found = record.get("version")
         if isinstance(found, bool) or not isinstance(found, int) or not 0 <= found < 1 << 32:
             raise CorruptFileError(f"{where}: expected the version to be a whole number, found a {type(found).__name__}; bake it again")
-        if found != VERSION:
+        if found not in (CUBE_VERSION, VERSION):
             raise FormatVersionError(
-                f"{where}: dataset version {found}, this program reads version {VERSION}; bake it again with this program"
+                f"{where}: dataset version {found}, this program reads versions {CUBE_VERSION} and {VERSION}; bake it again"
             )
-        top = Fields(record, where, _TOP_LEVEL)
+        top = Fields(record, where, _TOP_LEVEL if found == VERSION else _TOP_LEVEL - {"sky"})
+        basis, sky, patches = _directions(top, found)
         low, high = _corners(top)
         report = None if record["error_report"] is None else top.mapping("error_report")
         if not all_finite([report, top.mapping("settings")]):
@@ -144,9 +154,9 @@ class WorldInfo:
             location=_location(top.fields("location", Location.__dataclass_fields__)),
             bounds=np.array([low, high], np.float64),
             preset=top.text("preset"),
-            basis=top.choice("basis", BASES),
-            # Sky patches are the cube's faces: what other numbers stand for, this version does not say.
-            sky_patches=top.integer("sky_patches", len(CUBE_FACES), len(CUBE_FACES)),
+            basis=basis,
+            sky=sky,
+            sky_patches=patches,
             settings=top.mapping("settings"),
             seed=top.integer("seed"),
             sun_table=_sun_table(record["sun_table"], where),
@@ -160,6 +170,15 @@ class WorldInfo:
 
 _TOP_LEVEL = frozenset(WorldInfo.__dataclass_fields__) | {"format", "version"}
 _SECTOR_KEY = re.compile(r"(-?\d{1,7}),(-?\d{1,7})", re.ASCII)
+
+
+def _directions(top: Fields, version: int) -> tuple[str, str, int]:
+    """Basis, scheme of the sky patches, and their number."""
+    if version == CUBE_VERSION:
+        return top.choice("basis", ("cube",)), "faces", top.integer("sky_patches", len(CUBE_FACES), len(CUBE_FACES))
+    sky = top.choice("sky", SKY_SCHEMES)
+    least, most = (len(CUBE_FACES),) * 2 if sky == "faces" else (MIN_PATCHES, MAX_SKY_PATCHES)
+    return top.choice("basis", tuple(BASIS_SIZES)), sky, top.integer("sky_patches", least, most)
 
 
 def _sectors(top: Fields) -> dict[SectorIndex, SectorFacts]:
@@ -295,6 +314,10 @@ class Dataset:
         if len(sector.sun_visibility) != world.sun_table.plane_count:
             raise CorruptFileError(
                 f"{path}: {len(sector.sun_visibility)} sun planes, expected {world.sun_table.plane_count}; bake it again"
+            )
+        if sector.factor_weight.shape[1] != BASIS_SIZES[world.basis]:
+            raise CorruptFileError(
+                f"{path}: {sector.basis_size} coefficients, expected {BASIS_SIZES[world.basis]} of {world.basis}; bake it again"
             )
         # The device holds as many patches as world.json says; the file was checked against its own number.
         if int(sector.factor_source.max(initial=0)) >= sector.brick_count + world.sky_patches:

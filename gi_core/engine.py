@@ -8,10 +8,11 @@ import numpy as np
 import pyopencl as cl
 
 from gi_core.arrays import Float32, Float64, UInt8, UInt16
-from gi_core.constants import SECTOR_SIZE_M, VOLUME_SHAPE, VOXEL_NO_SECTOR
+from gi_core.basis import convert, served_from
+from gi_core.constants import BASIS_SIZES, SECTOR_SIZE_M, VOLUME_SHAPE, VOXEL_NO_SECTOR
 from gi_core.dataset import Dataset
 from gi_core.device import shared_device
-from gi_core.errors import FormatError, OutsideWorldError
+from gi_core.errors import FormatError, InputError, OutsideWorldError
 from gi_core.grid import SectorIndex, volume_first_voxel
 from gi_core.light_geometry import ShadowGeometry
 from gi_core.light_surfels import SurfelLights
@@ -19,10 +20,11 @@ from gi_core.lighting import Lighting
 from gi_core.lighting_model import make_lighting
 from gi_core.lights import lamps_digest, lamps_on
 from gi_core.relight import Relighter
-from gi_core.relight_input import relight_input, sky_face_exitance
+from gi_core.relight_input import relight_input
 from gi_core.resident_sector import ResidentSector
 from gi_core.sector import PROBE_IN_MARGIN
 from gi_core.settings import NEUTRAL, Settings
+from gi_core.sky_patches import face_exitance
 from gi_core.volume import SectorBox, Volume, box_mask, box_record, box_slices, nearest_columns, plan_boxes
 from gi_core.world import Lamp
 
@@ -96,7 +98,7 @@ class Engine:
         return make_lighting(self.dataset.world.location, time, weather)
 
     def lit_sector(self, index: SectorIndex, lighting: Lighting, settings: Settings = NEUTRAL) -> Float32:
-        """A sector's probe cubes (P, 6, 3) float32 [lx], bounces converged to relight.QUERY_RESIDUAL.
+        """The light of a sector's probes (P, B, 3) float32 [lx], in the dataset's basis, bounces converged to relight.QUERY_RESIDUAL.
 
         Raises SectorMissingError, CorruptFileError.
         """
@@ -114,7 +116,8 @@ class Engine:
                 self._lit.move_to_end(key)
                 return self._lit[key]
             resident, settings = self._resident(index), light.settings
-            given = relight_input(settings.light(light.lighting), self.dataset.world.sun_table)
+            world = self.dataset.world
+            given = relight_input(settings.light(light.lighting), world.sun_table, world.sky, world.sky_patches)
             self._set_lamps(resident, settings.brightened(light.lamps))
             found = self._relighter.converge(resident, given)
             cubes = settings.cubes(found.first_bounce, found.cubes, resident.sector.probe_room)
@@ -125,19 +128,26 @@ class Engine:
                 self._lit.popitem(last=False)
             return cubes
 
-    def volume(self, position: Float64, lighting: Lighting, settings: Settings = NEUTRAL) -> Volume:
-        """The volume centred on a world position (3,) [m], under the artists' settings. Raises OutsideWorldError, CorruptFileError."""
+    def volume(self, position: Float64, lighting: Lighting, settings: Settings = NEUTRAL, basis: str | None = None) -> Volume:
+        """The volume centred on a world position (3,) [m], under the artists' settings, in the dataset's basis or one that is poorer.
+
+        Raises InputError for a basis that the dataset cannot be served in, OutsideWorldError, CorruptFileError.
+        """
+        own = self.dataset.world.basis
+        basis = own if basis is None else basis
+        if basis not in served_from(own):
+            raise InputError(f"basis: this dataset was baked in {own}; expected {' or '.join(served_from(own))}, found {basis}")
         self._expect_inside(position)
         first = volume_first_voxel(position)
         boxes = [box for box in plan_boxes(first) if box.index in self.dataset.world.sectors]
         if not boxes:
             raise OutsideWorldError(self._outside(position))
-        values = np.zeros((6, *VOLUME_SHAPE, 3), np.float32)
+        values = np.zeros((BASIS_SIZES[basis], *VOLUME_SHAPE, 3), np.float32)
         mask = np.full(VOLUME_SHAPE, VOXEL_NO_SECTOR, np.uint8)
         light = self._light(lighting, settings)
         with self._lock:
             target = self._device.allocate(values.nbytes)
-            unlit = [box for box in boxes if not self._fill(box, light, target, mask)]
+            unlit = [box for box in boxes if not self._fill(box, light, target, mask, basis)]
             self._device.read(target, values)
         has_light = mask[0] != VOXEL_NO_SECTOR
         for box in unlit:  # it has air, but no probe: lit like columns without a sector, by the nearest that are
@@ -147,12 +157,12 @@ class Engine:
             values[:, :, lack[:, 0], lack[:, 1]] = values[:, :, nearest[:, 0], nearest[:, 1]]
         report = self.dataset.world.error_report
         expected = None if report is None else report.get("expected_error")
-        return Volume(values, mask, first, tuple(box.index for box in boxes), self.dataset.world.basis, expected)
+        return Volume(values, mask, first, tuple(box.index for box in boxes), basis, expected)
 
     def distant(self, lighting: Lighting) -> Distant:
         """One texel per sector of the whole world, lit by the sky alone (slide "Distant shading"). Raises CorruptFileError."""
         texels = self.dataset.distant()
-        values = texels.sky[..., None] * sky_face_exitance(lighting)
+        values = texels.sky[..., None] * face_exitance(lighting)
         return Distant(values.astype(np.float32), texels.origin, texels.valid)
 
     def probes(self, position: Float64, radius: float, lighting: Lighting) -> LitProbes:
@@ -174,20 +184,22 @@ class Engine:
             world = sector.probe_position + index.origin
             own = sector.probe_flags & PROBE_IN_MARGIN == 0
             near = np.flatnonzero(own & (np.linalg.norm(world - position, axis=1) <= radius))
-            found.append((world[near], cubes[near], sector.probe_room[near], sector.probe_flags[near], [index] * len(near)))
+            faces = convert(cubes[near], self.dataset.world.basis, "cube")
+            found.append((world[near], faces, sector.probe_room[near], sector.probe_flags[near], [index] * len(near)))
         if not found:
             raise OutsideWorldError(self._outside(position))
         position_, cubes_, room, flags = (np.concatenate([part[i] for part in found]) for i in range(4))
         return LitProbes(position_, cubes_, room, flags, tuple(s for part in found for s in part[4]))
 
-    def _fill(self, box: SectorBox, light: _Light, target: cl.Buffer, mask: UInt8) -> bool:
+    def _fill(self, box: SectorBox, light: _Light, target: cl.Buffer, mask: UInt8, basis: str) -> bool:
         """Fill a sector's part of a volume and its mask; whether the sector has a probe, and so any light."""
         cubes = self._lit_sector(box.index, light)
         resident = self._resident(box.index)
         sector = resident.sector
         resident.write_cubes(cubes)
         if sector.probe_count:
-            resident.fill_volume(box_record(box, sector), tuple(int(n) for n in box.size), target)
+            size = tuple(int(n) for n in box.size)
+            resident.fill_volume(box_record(box, sector), size, target, resident.converted(basis), basis)
         mask[box_slices(box)] = box_mask(box, sector)
         return sector.probe_count > 0
 

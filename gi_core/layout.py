@@ -68,7 +68,7 @@ class Record:
 
 BOUNCE = Record(
     "Bounce",
-    "How much of one row of the probes' cubes a brick sends on, per channel. row : ROW_ONE + probe * 6 + face.",
+    "How much of one row of the probes' light a brick sends on, per channel. row : ROW_ONE + probe * coefficients, and of the cube + face.",
     (("albedo", "float", 3), ("row", "uint", 1)),
 )
 DIRECTIONAL_LIGHT = Record(

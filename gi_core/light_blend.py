@@ -7,6 +7,7 @@ import numpy as np
 from gi_core.arrays import Float64
 from gi_core.lighting import DirectionalLight, Lighting
 from gi_core.relight_input import RelightInput
+from gi_core.sky_patches import level_shares
 from gi_core.spectrum import LUMINANCE_FROM_RGB
 
 # A light that turns by an angle moves the edges of shadows, which changes more than its cosine says.
@@ -61,7 +62,7 @@ class LightVector:
             strength = float(light["irradiance"][:3].astype(np.float64) @ LUMINANCE_FROM_RGB)
             beams[i] = light["direction"][:3].astype(np.float64) * strength
             level += strength * max(float(light["direction"][1]), 0.1)
-        scale = float(patches.max(initial=0.0)) + level
+        scale = float(level_shares(given.sky, len(patches)) @ patches) + level
         return cls(np.concatenate([patches / len(patches), _TURN_WEIGHT * beams.reshape(-1), [given.snow * scale]]), scale)
 
 

@@ -9,18 +9,20 @@ import numpy as np
 import pyopencl as cl
 
 from gi_core.arrays import Float32, Float64
+from gi_core.basis import basis_of_size, from_axes
 from gi_core.device import Device
 from gi_core.light_blend import LightVector
 from gi_core.light_geometry import ShadowGeometry
 from gi_core.light_surfels import SurfelLights
 from gi_core.lighting import Lighting
 from gi_core.relight import Relighter
-from gi_core.relight_input import RelightInput, sky_face_exitance
+from gi_core.relight_input import RelightInput
 from gi_core.resident_sector import ResidentSector
 from gi_core.sector import Sector
 from gi_core.settings import Settings
 from gi_core.shadow_map import ShadowMap, SunSamples
 from gi_core.shadow_plan import ShadowPlan
+from gi_core.sky_patches import face_exitance
 from gi_core.world import Lamp
 
 # After a change this large, as a share, a relight makes several passes, so that bounces follow at once.
@@ -58,7 +60,7 @@ class LiveLight:
     @cached_property
     def distant(self) -> Float32:
         """(6, 3) float32 [lx]: what a distant probe's sky factors multiply."""
-        return sky_face_exitance(self.lighting)
+        return face_exitance(self.lighting)
 
 
 class LiveSector:
@@ -171,9 +173,12 @@ class LiveSector:
         if changed:
             self.shown_at = tick
 
-    def shown(self, settings: Settings, placeholder: Callable[[], Float32]) -> cl.Buffer:
-        """The cubes to show, on the device: the sector's own, or a blend with ``placeholder`` (6, 3) [lx] while it fades in, under the
-        artists' gains."""
+    def shown(self, settings: Settings, placeholder: Callable[[], Float32], basis: str) -> cl.Buffer:
+        """The light to show, on the device, in a basis: the sector's own, or a blend with ``placeholder`` (6, 3) [lx], a cube, while it
+        fades in, under the artists' gains."""
+        return self.resident.converted(basis, self._own_shown(settings, placeholder))
+
+    def _own_shown(self, settings: Settings, placeholder: Callable[[], Float32]) -> cl.Buffer:
         if not self.is_fading and settings.bounce_factor == 1.0 and not settings.has_ambient:
             self._shown = self._first = self._room = None
             return self.resident.cubes
@@ -192,8 +197,9 @@ class LiveSector:
             self._room = device.upload(sector.probe_room)
         gains = settings.bounce_factor != 1.0
         ambient = np.zeros((2, sector.basis_size, 4), np.float32)
-        ambient[:, :, :3] = settings.ambient_cubes
-        standing_in = np.pad(placeholder.astype(np.float32), ((0, 0), (0, 1)))
+        basis = basis_of_size(sector.basis_size)
+        ambient[:, :, :3] = settings.ambient(basis)
+        standing_in = np.pad(from_axes(basis) @ placeholder.astype(np.float32), ((0, 0), (0, 1)))
         arguments: list[object] = [np.uint32(rows), resident.cubes]
         if gains:
             self._first = self._first or device.allocate(16 * rows)

@@ -7,13 +7,14 @@ import numpy as np
 import pyopencl as cl
 
 from gi_core.arrays import AnyArray, Float32, Int64, UInt8
-from gi_core.constants import VOLUME_SHAPE, VOXEL_NO_SECTOR
+from gi_core.basis import from_axes
+from gi_core.constants import BASIS_SIZES, VOLUME_SHAPE, VOXEL_NO_SECTOR
 from gi_core.device import Device
 from gi_core.grid import SectorIndex
 from gi_core.live_sector import LiveSector
 from gi_core.volume import SectorBox, box_mask, box_record, box_slices, nearest_columns, plan_boxes
 
-# Cubes of a sector to show at this tick, on the device.
+# Light of a sector to show at this tick, on the device.
 ShownCubes = Callable[[LiveSector], cl.Buffer]
 
 
@@ -21,7 +22,7 @@ ShownCubes = Callable[[LiveSector], cl.Buffer]
 class PublishedVolume:
     """What clients see of a player's volume; read-only, and replaced by another when something changes.
 
-    values : (6, 16, 32, 32, 3) float32 [lx]; mask : (16, 32, 32) uint8, as in volume.Volume
+    values : (B, 16, 32, 32, 3) float32 [lx] in ``basis``; mask : (16, 32, 32) uint8, as in volume.Volume
     first_voxel : (3,) int64, world lattice index of voxel (0, 0, 0)
     tick : in which it was filled; missing : sectors that it touches and that are not there (yet)
     """
@@ -32,6 +33,7 @@ class PublishedVolume:
     tick: int
     sectors: tuple[SectorIndex, ...]
     missing: tuple[SectorIndex, ...]
+    basis: str = "cube"
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +55,8 @@ class _Layout:
 class LiveVolume:
     """One player's. The ticker's alone; what it publishes is anybody's."""
 
-    def __init__(self, device: Device) -> None:
+    def __init__(self, device: Device, basis: str = "cube") -> None:
+        self.basis = basis
         self.published: PublishedVolume | None = None
         self.touched: tuple[SectorIndex, ...] = ()
         """Sectors of the world that it reads, there or not."""
@@ -61,7 +64,7 @@ class LiveVolume:
         self._first: Int64 = np.zeros(3, np.int64)
         self._layout: _Layout | None = None
         self._present: frozenset[SectorIndex] = frozenset()
-        self._buffer = device.allocate(4 * 3 * 6 * int(np.prod(VOLUME_SHAPE)))
+        self._buffer = device.allocate(4 * 3 * BASIS_SIZES[basis] * int(np.prod(VOLUME_SHAPE)))
         self._filled_at = -1
 
     @property
@@ -87,18 +90,18 @@ class LiveVolume:
         for box, record in layout.boxes:
             sector = residents[box.index]
             if fresh or sector.shown_at > self._filled_at:
-                sector.resident.fill_volume(record, tuple(int(n) for n in box.size), self._buffer, shown(sector))
-        values = np.empty((6, *VOLUME_SHAPE, 3), np.float32)
+                sector.resident.fill_volume(record, tuple(int(n) for n in box.size), self._buffer, shown(sector), self.basis)
+        values = np.empty((BASIS_SIZES[self.basis], *VOLUME_SHAPE, 3), np.float32)
         self._device.read(self._buffer, values)
         for index, z, x in layout.placeholders:
-            values[:, :, z, x] = placeholder(index)[:, None, None, None]
+            values[:, :, z, x] = (from_axes(self.basis) @ placeholder(index))[:, None, None, None]
         if layout.outside is not None:
             lack, nearest = layout.outside
             values[:, :, lack[:, 0], lack[:, 1]] = values[:, :, nearest[:, 0], nearest[:, 1]]
         values.setflags(write=False)
         self._filled_at = tick
         missing = tuple(index for index, _, _ in layout.placeholders)
-        self.published = PublishedVolume(values, layout.mask, self._first, tick, layout.sectors, missing)
+        self.published = PublishedVolume(values, layout.mask, self._first, tick, layout.sectors, missing, self.basis)
         return self.published
 
 

@@ -23,7 +23,8 @@ import numpy as np
 import pyopencl as cl
 
 from gi_core.arrays import Float32, Float64
-from gi_core.constants import VOLUME_SHAPE
+from gi_core.basis import conversion
+from gi_core.constants import BASIS_SIZES, VOLUME_SHAPE
 from gi_core.dataset import Dataset
 from gi_core.device import Device
 from gi_core.grid import SectorIndex, volume_first_voxel
@@ -88,12 +89,13 @@ class LiveWorld:
         budget_bytes: int = DEFAULT_BUDGET_BYTES,
         places: int = PLACES,
         shadow_map: bool = True,
+        basis: str = "cube",
         stream: StreamOptions | None = None,
     ) -> None:
         """A queue of its own on the device, so that queries and ticks do not wait for each other.
 
-        budget_bytes : of resident sectors on the device; places : sectors to relight in a tick
-        Raises DeviceError.
+        budget_bytes : of resident sectors on the device; places : sectors to relight in a tick; basis : of players' volumes
+        Raises DeviceError, and InputError for a basis that the dataset cannot be served in.
         """
         self.dataset = dataset
         self.volumes: dict[str, LiveVolume] = {}
@@ -101,6 +103,8 @@ class LiveWorld:
         self._device = Device(device)
         self._relighter = Relighter(self._device)
         self._places = places
+        conversion(dataset.world.basis, basis)
+        self.basis = basis
         self._known = frozenset(dataset.world.sectors)
         self._geometry = ShadowGeometry(dataset.geometry, dataset.world.sectors)
         self._tracing = threading.Lock()
@@ -183,13 +187,14 @@ class LiveWorld:
         for lights, snow, lamps, sun_map in product(range(MAX_DIRECTIONAL_LIGHTS + 1), (0.0, 0.5), (None, lamp_light), (None, samples)):
             sector.resident.set_lamps(lamps)
             sector.resident.set_sun_sample(sun_map)
-            given = RelightInput(np.ones((world.sky_patches, 3), np.float32), np.zeros(lights, DIRECTIONAL_LIGHT.dtype), snow)
+            dark = np.zeros(lights, DIRECTIONAL_LIGHT.dtype)
+            given = RelightInput(np.ones((world.sky_patches, 3), np.float32), dark, snow, world.sky)
             self._relighter.relight([sector.resident], given)
         for settings in (NEUTRAL, Settings(bounce_factor=2.0)):
             box = plan_boxes(volume_first_voxel(index.origin + 32.0))[0]
-            target = self._device.allocate(4 * 18 * int(np.prod(VOLUME_SHAPE)))
-            cubes = sector.shown(settings, lambda: np.zeros((6, 3), np.float32))
-            sector.resident.fill_volume(box_record(box, sector.resident.sector), (1, 1, 1), target, cubes)
+            target = self._device.allocate(4 * 3 * BASIS_SIZES[self.basis] * int(np.prod(VOLUME_SHAPE)))
+            cubes = sector.shown(settings, lambda: np.zeros((6, 3), np.float32), self.basis)
+            sector.resident.fill_volume(box_record(box, sector.resident.sector), (1, 1, 1), target, cubes, self.basis)
         if self._shadows is not None:
             self._shadows.warm_up(sector)
         self._device.queue.finish()
@@ -253,7 +258,7 @@ class LiveWorld:
                 self._firsts[name] = place
                 volume = self.volumes.get(name)
                 if volume is None:
-                    volume = self.volumes[name] = LiveVolume(self._device)
+                    volume = self.volumes[name] = LiveVolume(self._device, self.basis)
                 self._unread(name, volume)
                 volume.move(firsts[row], self._known)
                 for index in volume.touched:
@@ -295,7 +300,7 @@ class LiveWorld:
         report.filled, report.waiting = tuple(filled), len(self._stale) - held
 
     def _shown(self, sector: LiveSector, light: LiveLight) -> cl.Buffer:
-        return sector.shown(light.settings, lambda: self._placeholder(sector.resident.sector.index))
+        return sector.shown(light.settings, lambda: self._placeholder(sector.resident.sector.index), self.basis)
 
     def _placeholder(self, index: SectorIndex) -> Float32:
         """(6, 3) [lx]: the distant probe that stands in for a sector (slide "Distant shading")."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gi_core.arrays import Float32
-from gi_core.constants import ALBEDO_MAX
+from gi_core.basis import FEEDBACK, basis_of_size
 from gi_core.device import Device
 from gi_core.relight_input import RelightInput
 from gi_core.resident_sector import LightOnDevice, ResidentSector
@@ -17,8 +17,6 @@ QUERY_RESIDUAL = 1e-5
 _PASSES_PER_LOOK = 4
 # With every albedo at ALBEDO_MAX in a closed room, 0.95 ** 512 is 4e-12.
 MAX_PASSES = 512
-# The loop loses at least 1 - ALBEDO_MAX of the light at every bounce.
-_SLOWEST_RATE = ALBEDO_MAX
 
 
 @dataclass(frozen=True)
@@ -62,6 +60,7 @@ class Relighter:
         """
         sector = resident.sector
         after = np.zeros((sector.probe_count, sector.basis_size, 3), np.float32)
+        slowest = FEEDBACK[basis_of_size(sector.basis_size)].shrinks
         if sector.probe_count == 0:
             return Converged(after, after, 0.0, 0)
         resident.write_cubes(after)
@@ -77,7 +76,7 @@ class Relighter:
             peak, change = float(np.abs(after).max()), float(np.abs(after - before).max())
             if change <= np.finfo(np.float32).eps * peak:
                 return Converged(after, first, 0.0, passes)
-            rate = min((change / last_change) ** (1 / _PASSES_PER_LOOK), _SLOWEST_RATE) if last_change else _SLOWEST_RATE
+            rate = min((change / last_change) ** (1 / _PASSES_PER_LOOK), slowest) if last_change else slowest
             left, last_change = change * rate / (1 - rate) / peak, change
             if left <= residual:
                 break

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from gi_core.ambient_cube import basis_weights
-from gi_core.arrays import AnyArray, Float64, UInt8
-from gi_core.constants import SNOW_ALBEDO
+from gi_core.arrays import AnyArray, Float32, Float64, UInt8
+from gi_core.basis import FEEDBACK, basis_of_size, feedback_weights
+from gi_core.constants import BASIS_SIZES, SNOW_ALBEDO
 from gi_core.layout import NO_SAMPLE, WHOLE_SAMPLE
 from gi_core.relight_input import RelightInput
 from gi_core.sector import Sector, counts
@@ -65,15 +65,37 @@ def light_bricks(
     return brick_means(sector, exitance)
 
 
+def brick_basis(sector: Sector) -> Float32:
+    """(N, B) float32: the mean over each brick's surfels of what coefficients add to a bounce along their normals."""
+    weights = feedback_weights(basis_of_size(sector.basis_size), sector.surfel_normal)
+    return np.asarray(brick_means(sector, weights), np.float32)
+
+
+def _feedback_weights(sector: Sector) -> Float32:
+    """(S, B): how each surfel reads its probes' light. A cube's faces along its own normal, harmonics along its brick's mean basis."""
+    if sector.basis_size == BASIS_SIZES["cube"]:
+        return feedback_weights("cube", sector.surfel_normal)
+    return np.repeat(brick_basis(sector), counts(sector.brick_starts), axis=0)
+
+
 def bounce_bricks(sector: Sector, given: RelightInput, cubes: AnyArray, dtype: Any = np.float32) -> AnyArray:
-    """(N, 3) [lx]: what bricks send on of last pass's cubes (P, 6, 3), surfel by surfel. Its kernel sums by brick and probe beforehand."""
+    """(N, 3) [lx]: what bricks send on of last pass's light (P, B, 3), surfel by surfel. Its kernel sums by brick and probe beforehand.
+
+    Of harmonics it may lie below 0: ``relight`` cuts off what a brick then lacks in all.
+    """
     irradiance = np.zeros((sector.surfel_count, 3), dtype)
     if sector.probe_count:
-        face_weight = basis_weights(sector.surfel_normal).astype(dtype)
+        weight = _feedback_weights(sector).astype(dtype)
         for k in range(sector.feedback_probe.shape[1]):
-            bounced = np.einsum("sb,sbc->sc", face_weight, cubes[sector.feedback_probe[:, k]])
+            bounced = np.einsum("sb,sbc->sc", weight, cubes[sector.feedback_probe[:, k]])
             irradiance += sector.feedback_weight[:, k, None].astype(dtype) * bounced
-    return brick_means(sector, snowed_albedo(sector, given.snow, dtype) * irradiance)
+    albedo = np.minimum(snowed_albedo(sector, given.snow, dtype), dtype(FEEDBACK[basis_of_size(sector.basis_size)].albedo_max))
+    return brick_means(sector, albedo * irradiance)
+
+
+def brick_exitance(direct: AnyArray, bounced: AnyArray) -> AnyArray:
+    """(N, 3) [lx]: what bricks send out of their own and of bounces; nothing is darker than black, though harmonics may say so."""
+    return np.maximum(direct + bounced, 0)
 
 
 def gather_probes(sector: Sector, exitance: AnyArray, dtype: Any = np.float32) -> AnyArray:
@@ -102,7 +124,7 @@ def relight(
     direct = light_bricks(sector, given, lamps, dtype, sun_sample)
     patches = given.patch_exitance.astype(dtype)
     for _ in range(passes):
-        exitance = np.concatenate([direct + bounce_bricks(sector, given, cubes, dtype), patches])
+        exitance = np.concatenate([brick_exitance(direct, bounce_bricks(sector, given, cubes, dtype)), patches])
         cubes = gather_probes(sector, exitance, dtype)
     return cubes
 
@@ -114,8 +136,8 @@ def solve(
     cubes = np.zeros((sector.probe_count, sector.basis_size, 3))
     direct = light_bricks(sector, given, lamps, np.float64)
     for _ in range(max_passes):
-        bounced = bounce_bricks(sector, given, cubes, np.float64)
-        after = gather_probes(sector, np.concatenate([direct + bounced, given.patch_exitance.astype(np.float64)]), np.float64)
+        bricks = brick_exitance(direct, bounce_bricks(sector, given, cubes, np.float64))
+        after = gather_probes(sector, np.concatenate([bricks, given.patch_exitance.astype(np.float64)]), np.float64)
         change, cubes = np.abs(after - cubes).max(initial=0), after
         if change <= tolerance * np.abs(cubes).max(initial=0):
             break

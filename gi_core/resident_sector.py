@@ -17,6 +17,8 @@ import pyopencl as cl
 
 from gi_core import relight_twin
 from gi_core.arrays import AnyArray, Float32, UInt32
+from gi_core.basis import FEEDBACK, basis_of_size, conversion
+from gi_core.constants import BASIS_SIZES
 from gi_core.device import Device, SharedKernel
 from gi_core.layout import BOUNCE
 from gi_core.relight_input import RelightInput
@@ -25,7 +27,8 @@ from gi_core.sector import Sector, starts
 Launch = Callable[..., None]
 
 VOXEL_GROUP = (8, 4, 1)  # work-items of fill_volume.cl along x, y, z; see SharedKernel
-WEIGHTS_PER_VECTOR = 4
+# gather_probes.cl reads whole vectors, beyond the last factor's weights.
+PADDING_WEIGHTS = 8
 SURFELS_PER_GROUP = 8  # of sun_on_surfels.cl: a byte of a plane's bits
 
 
@@ -54,6 +57,7 @@ class ResidentSector:
         normal[:, : sector.surfel_count] = sector.surfel_normal.T
         self.surfel_normal = device.upload(normal)
         self.brick_starts = device.upload(sector.brick_starts)
+        self.brick_basis = None if sector.basis_size == BASIS_SIZES["cube"] else device.upload(relight_twin.brick_basis(sector))
         self.brick_emission = None if sector.surfel_emission is None else device.upload(_brick_emission(sector))
         self.factor_starts = device.upload(sector.factor_starts)
         self.factor_source = device.upload(sector.factor_source)
@@ -71,6 +75,8 @@ class ResidentSector:
         self.sun_sample: cl.Buffer | None = None
         self._lamps: cl.Buffer | None = None
         self._sky_patches = sky_patches
+        self._converted: tuple[str, cl.Buffer, cl.Buffer] | None = None
+        self._is_cube = sector.basis_size == BASIS_SIZES["cube"]
         self._has_snow = bool(sector.surfel_snow.any())
         self._light: LightOnDevice | None = None
         self._direct_of: object = None
@@ -80,7 +86,8 @@ class ResidentSector:
     @property
     def nbytes(self) -> int:
         """Bytes on the device."""
-        return sum(value.size for value in vars(self).values() if isinstance(value, cl.Buffer))
+        own = sum(value.size for value in vars(self).values() if isinstance(value, cl.Buffer))
+        return own + (sum(buffer.size for buffer in self._converted[1:]) if self._converted else 0)
 
     def prepare(self) -> None:
         """Do now what the first light would wait for, should another thread have the time."""
@@ -154,13 +161,36 @@ class ResidentSector:
         self._bounce_bricks(no_bounces)(self._light.patches)
         self._gather_probes(cubes)()
 
-    def fill_volume(self, box: AnyArray, size: tuple[int, ...], target: cl.Buffer, cubes: cl.Buffer | None = None) -> None:
+    def converted(self, basis: str, cubes: cl.Buffer | None = None) -> cl.Buffer:
+        """The sector's light, or other ``cubes`` of its probes, in a basis that is served: a buffer that the next call writes again.
+
+        Raises InputError for a basis that is richer than the sector's.
+        """
+        source = self.cubes if cubes is None else cubes
+        own, size = self.sector.basis_size, BASIS_SIZES[basis]
+        if own == size:
+            return source
+        rows = self.sector.probe_count * size
+        if self._converted is None or self._converted[0] != basis:
+            matrix = self.device.upload(conversion(basis_of_size(own), basis))
+            self._converted = basis, matrix, self.device.allocate(16 * rows)
+        _, matrix, target = self._converted
+        if rows:
+            self.device.shared_kernel("convert_probes", FROM_SIZE=own, TO_SIZE=size).launch_1d(
+                rows, np.uint32(rows), source, matrix, target
+            )
+        return target
+
+    def fill_volume(
+        self, box: AnyArray, size: tuple[int, ...], target: cl.Buffer, cubes: cl.Buffer | None = None, basis: str | None = None
+    ) -> None:
         """Enqueue this sector's part of a volume: ``box`` (1,) layout.VOLUME_BOX, its size (x, y, z), the volume's buffer.
 
-        ``cubes`` are shown in place of the sector's own.
+        ``cubes`` are shown in place of the sector's own; they, and the volume, are in ``basis`` where it is given.
         """
         sector = self.sector
-        kernel = self.device.shared_kernel("fill_volume", BASIS_SIZE=sector.basis_size, VOXEL_PROBES=sector.voxel_probe.shape[3])
+        coefficients = sector.basis_size if basis is None else BASIS_SIZES[basis]
+        kernel = self.device.shared_kernel("fill_volume", BASIS_SIZE=coefficients, VOXEL_PROBES=sector.voxel_probe.shape[3])
         whole = tuple(-(-count // group) * group for count, group in zip(size, VOXEL_GROUP, strict=True))
         kernel.launch(whole, VOXEL_GROUP, box, self.voxel_probe, self.voxel_weight, self.cubes if cubes is None else cubes, target)
 
@@ -222,14 +252,14 @@ class ResidentSector:
         """Lacks the sky patches."""
         bricks, patches = self.sector.brick_count, self._sky_patches
         bounces = (bounce_starts or self.bounce_starts or self.direct, self.bounces or self.direct)
-        kernel = self.device.shared_kernel("bounce_bricks")
+        kernel = self.device.shared_kernel("bounce_bricks", BASIS_SIZE=self.sector.basis_size)
         counts = (np.uint32(bricks), np.uint32(patches))
-        return self._launch(kernel, bricks + patches, *counts, *bounces, self.direct, self.cubes, self.exitance)
+        light = (self.direct, self.cubes, *([] if self.brick_basis is None else [self.brick_basis]))
+        return self._launch(kernel, bricks + patches, *counts, *bounces, *light, self.exitance)
 
     def _gather_probes(self, cubes: cl.Buffer) -> Launch:
         sector = self.sector
-        vectors = -(-sector.basis_size // WEIGHTS_PER_VECTOR)
-        kernel = self.device.shared_kernel("gather_probes", BASIS_SIZE=sector.basis_size, WEIGHT_VECTORS=vectors)
+        kernel = self.device.shared_kernel("gather_probes", BASIS_SIZE=sector.basis_size)
         factors = (self.factor_starts, self.factor_source, self.factor_weight)
         return self._launch(kernel, sector.probe_count, np.uint32(sector.probe_count), *factors, self.exitance, cubes)
 
@@ -239,9 +269,11 @@ class ResidentSector:
         weighted = sector.feedback_probe.shape[1] > 1 or not (sector.feedback_weight == 1).all()
         kernel = self.device.shared_kernel(
             "collect_bounces",
+            BASIS_SIZE=sector.basis_size,
             FEEDBACK_PROBES=sector.feedback_probe.shape[1],
             HAS_FEEDBACK_WEIGHTS=int(weighted),
             HAS_SNOW=int(snow > 0),
+            BOUNCE_ALBEDO_PERMILLE=round(1000 * FEEDBACK[basis_of_size(sector.basis_size)].albedo_max),
         )
         probe = device.upload(sector.feedback_probe)
         weight = [device.upload(sector.feedback_weight)] if weighted else []
@@ -249,13 +281,14 @@ class ResidentSector:
 
         def collect(bounce_starts: cl.Buffer, bounces: cl.Buffer) -> None:
             last = [np.float32(snow)] if snow > 0 else []
-            surfels = [self.surfel_albedo, self.surfel_normal, np.uint32(self._groups * SURFELS_PER_GROUP)]
+            surfels = [self.surfel_normal, np.uint32(self._groups * SURFELS_PER_GROUP)] if self._is_cube else []
             bricks = np.uint32(sector.brick_count)
-            written = (bounce_starts, bounces, count)
-            self._launch(kernel, sector.brick_count, bricks, self.brick_starts, *surfels, probe, *weight, *written, *last)()
+            read = (self.brick_starts, self.surfel_albedo, *surfels, probe, *weight)
+            self._launch(kernel, sector.brick_count, bricks, *read, bounce_starts, bounces, count, *last)()
 
         if self.bounce_starts is None:
-            most = 3 * sector.feedback_probe.shape[1]
+            # A surfel reads one face of the cube for each axis.
+            most = (3 if self._is_cube else 1) * sector.feedback_probe.shape[1]
             # Not zeroed: most of it is never touched, and so never takes memory.
             scratch = cl.Buffer(device.context, cl.mem_flags.READ_WRITE, most * sector.surfel_count * BOUNCE.dtype.itemsize)
             collect(device.upload(most * sector.brick_starts), scratch)
@@ -276,4 +309,4 @@ def _brick_emission(sector: Sector) -> Float32:
 
 def padded_weights(weights: Float32) -> Float32:
     """Factor weights (F, B) in one row, and behind them zeros for the last factor's vectors to reach into."""
-    return np.concatenate([weights.reshape(-1), np.zeros(2 * WEIGHTS_PER_VECTOR, np.float32)])
+    return np.concatenate([weights.reshape(-1), np.zeros(PADDING_WEIGHTS, np.float32)])

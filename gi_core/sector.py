@@ -10,8 +10,9 @@ minus ``SectorIndex.origin``, so that a world 50 km from its origin loses nothin
     surfel s  is lit by sun and moon through sun_visibility, by feedback_probe[s] with feedback_weight[s], and by its emission
     voxel v   blends probes voxel_probe[v] with voxel_weight[v]
 
-A factor's weight times its source's exitance [lx] is irradiance [lx]: weights are form factors, and over one cube face they sum to
-at most one (sky included). A sky patch's exitance is pi times its radiance.
+A factor's weight times its source's exitance [lx] is what it adds to a coefficient of the probe's irradiance [lx] (gi_core.basis). Of the
+cube, weights are form factors: over one face they sum to at most one (sky included); so do the harmonics', times basis.factor_shares.
+A sky patch's exitance is pi times its radiance.
 """
 
 from dataclasses import dataclass, fields
@@ -19,6 +20,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from gi_core.arrays import AnyArray, Float32, Int32, Int64, UInt8, UInt16, UInt32
+from gi_core.basis import basis_of_size, factor_shares
 from gi_core.constants import ALBEDO_MAX, BASIS_SIZES, MAX_BRICK_LEVEL, MAX_PROBES_PER_SECTOR, MAX_SKY_PATCHES
 from gi_core.errors import CorruptFileError
 from gi_core.grid import SectorIndex, voxel_columns
@@ -35,7 +37,7 @@ class Sector:
     probe_room : (P,) uint16, 0 outdoors
     factor_starts : (P + 1,) uint32
     factor_source : (F,) uint32, < N a brick, otherwise sky patch source - N
-    factor_weight : (F, B) float32, form factors
+    factor_weight : (F, B) float32
     brick_starts : (N + 1,) uint32; no brick is empty
     brick_level : (N,) uint8; a brick's cell is BRICK_CELL_M * 2 ** level wide, its surfels' cells SURFEL_CELL_M * 2 ** level
     brick_cell : (N, 3) int32, which cell of that size in sector-local space
@@ -177,11 +179,13 @@ def check_sector(sector: Sector, sky_patches: int) -> None:
         if isinstance(values, np.ndarray) and values.dtype.kind == "f":
             expect(np.isfinite(values).all(), f"finite {field.name}")
     # Float32 may round 0.95 and sums up by 6e-8.
-    lowest = 0 if s.basis_size == BASIS_SIZES["cube"] else -1 - 1e-6
-    expect((s.factor_weight >= lowest).all() and (s.factor_weight <= 1 + 1e-6).all(), f"factor_weight within {lowest:.0f}..1")
+    basis = basis_of_size(s.basis_size)
+    lowest = 0 if basis == "cube" else -1 - 1e-6
+    share = s.factor_weight if basis == "cube" else s.factor_weight * factor_shares(basis).astype(np.float32)
+    expect((share >= lowest).all() and (share <= 1 + 1e-6).all(), f"shares of factor_weight within {lowest:.0f}..1")
     expect((s.surfel_albedo >= 0).all() and (s.surfel_albedo <= ALBEDO_MAX + 1e-6).all(), f"surfel_albedo within 0..{ALBEDO_MAX}")
     if s.factor_count:
-        totals = np.add.reduceat(s.factor_weight, s.factor_starts[:-1][counts(s.factor_starts) > 0], dtype=np.float64)
+        totals = np.add.reduceat(share, s.factor_starts[:-1][counts(s.factor_starts) > 0], dtype=np.float64)
         # Float32 sums of rounded weights; 1 % leaves each bounce losing 4 % even where every albedo is at its bound.
         expect((totals <= 1.01).all(), f"a probe's factor weights to sum to at most 1 in each basis function, got {totals.max():.3f}")
     expect(s.surfel_emission is None or (s.surfel_emission >= 0).all(), "no negative surfel_emission")

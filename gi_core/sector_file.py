@@ -8,6 +8,7 @@ import numpy as np
 
 from gi_core import container, quantise
 from gi_core.arrays import AnyArray, Float32
+from gi_core.basis import basis_of_size, factor_shares
 from gi_core.constants import ALBEDO_MAX, BASIS_SIZES, BRICK_CELL_M, MAX_BRICK_LEVEL
 from gi_core.container import Container
 from gi_core.errors import CorruptFileError
@@ -62,7 +63,10 @@ def encode(sector: Sector, meta: dict[str, Any], sky_patches: int) -> bytes:
         "voxel_weight": np.moveaxis(quantise.encode_fraction(s.voxel_weight), 3, 0),
     }
     if s.feedback_probe.shape[1] > 1:
-        arrays["feedback_weight"] = quantise.encode_fraction(s.feedback_weight).T
+        # Shares only count beside each other: the largest of a surfel has all of a byte.
+        arrays["feedback_weight"] = quantise.encode_fraction(
+            s.feedback_weight / np.maximum(s.feedback_weight.max(axis=1, keepdims=True), 1e-30)
+        ).T
     if s.surfel_emission is not None:
         arrays["surfel_emission"] = s.surfel_emission.astype(np.float32).T
     full_meta = {
@@ -115,7 +119,7 @@ def _probe_of_factor(factor_starts: AnyArray) -> AnyArray:
 def _encode_weights(s: Sector) -> tuple[AnyArray, AnyArray]:
     """Factor weights as (B, F) codes of their square root, and float16 (2, B, P) scales for bricks and sky.
 
-    The cube's are uint8; spherical harmonics have a sign, and int8.
+    The cube's are uint8; spherical harmonics have a sign, and int8, and are stored as shares (basis.factor_shares).
 
     A scale is chosen so that each probe's weights (their magnitudes) still sum to what they did: rounding moves light between a
     probe's bricks, but neither makes nor loses any.
@@ -124,10 +128,11 @@ def _encode_weights(s: Sector) -> tuple[AnyArray, AnyArray]:
     row = _is_sky(s) * probes + _probe_of_factor(s.factor_starts)  # bricks first, then sky
     signed = basis != BASIS_SIZES["cube"]
     encode_code, decode_code = _ROOTS[signed]
+    share = factor_shares(basis_of_size(basis))
     codes = np.zeros((basis, s.factor_count), np.int8 if signed else np.uint8)
     scales = np.zeros((2, basis, probes), np.float16)
     for b in range(basis):
-        weight = s.factor_weight[:, b].astype(np.float64)
+        weight = s.factor_weight[:, b].astype(np.float64) * share[b]
         top = np.zeros(2 * probes)
         np.maximum.at(top, row, np.abs(weight))
         codes[b] = encode_code(weight / np.maximum(top[row], 1e-30))
@@ -143,7 +148,10 @@ def _decode_weights(codes: AnyArray, scales: AnyArray, factor_starts: AnyArray, 
         raise CorruptFileError("factor_scale is not finite")
     scale = scales.astype(np.float32)[is_sky.astype(np.int64), :, probe]  # (F, B)
     _, decode_code = _ROOTS[codes.dtype == np.int8]
-    return np.ascontiguousarray(decode_code(codes).T * scale)
+    stored = np.ascontiguousarray(decode_code(codes).T * scale)
+    if codes.dtype == np.int8:
+        stored /= factor_shares(basis_of_size(len(codes))).astype(np.float32)
+    return stored
 
 
 def _sector(found: Container) -> Sector:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from gi_core.arrays import Float32, UInt16
+from gi_core.basis import basis_of_size, from_axes
 from gi_core.constants import ROOM_OUTDOORS
 from gi_core.errors import InputError
 from gi_core.lighting import DirectionalLight, Lighting
@@ -90,13 +91,17 @@ class Settings:
         ambient = np.stack([side, side, up, down, side, side]).astype(np.float32)
         return np.array([self.exterior_ambient_scale, self.interior_ambient_scale], np.float32)[:, None, None] * ambient
 
+    def ambient(self, basis: str) -> Float32:
+        """(2, B, 3) float32 [lx]: ``ambient_cubes`` in a basis; harmonics hold what lies between up, down and their mean exactly."""
+        return self.ambient_cubes if basis == "cube" else np.asarray(from_axes(basis) @ self.ambient_cubes, np.float32)
+
     def cubes(self, first_bounce: Float32, converged: Float32, room: UInt16) -> Float32:
-        """Probe cubes (P, 6, 3) [lx] from those with one bounce and with all, and each probe's room (P,)."""
+        """Probes' light (P, B, 3) [lx] from that with one bounce and with all, and each probe's room (P,)."""
         cubes = converged
         if self.bounce_factor != 1.0:
             cubes = first_bounce + np.float32(self.bounce_factor) * (converged - first_bounce)
         if self.has_ambient:
-            cubes = cubes + self.ambient_cubes[(room != ROOM_OUTDOORS).astype(np.intp)]
+            cubes = cubes + self.ambient(basis_of_size(cubes.shape[1]))[(room != ROOM_OUTDOORS).astype(np.intp)]
         return cubes
 
 

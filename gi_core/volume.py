@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gi_core.arrays import AnyArray, Bool, Float32, Float64, Int64, UInt8
+from gi_core.basis import basis_of_size, evaluate
 from gi_core.constants import SECTOR_SIZE_M, VOLUME_SHAPE, VOXEL_INDOORS, VOXEL_OUTDOORS, VOXEL_SIZE_M, VOXEL_SOLID
 from gi_core.grid import SectorIndex, voxel_centre, voxel_columns
 from gi_core.layout import VOLUME_BOX
@@ -127,7 +128,8 @@ def sample_volume(values: Float32, origin: Float64, voxel_size: Float64, points:
 
     Parameters
     ----------
-    values : (6, ny, nz, nx, 3) float32 [lx], an ambient cube volume; origin : (3,) [m], centre of voxel (0, 0, 0); voxel_size : (3,) [m]
+    values : (B, ny, nz, nx, 3) float32 [lx], in the basis of B coefficients; origin : (3,) [m], centre of voxel (0, 0, 0)
+    voxel_size : (3,) [m]
     points : (n, 3) [m], world frame, on surfaces; normals : (n, 3) unit
 
     Returns
@@ -137,6 +139,10 @@ def sample_volume(values: Float32, origin: Float64, voxel_size: Float64, points:
     Beyond the volume's outermost voxel centres its edge is read, as with a clamped texture.
     """
     normals = np.asarray(normals, np.float32)
+    basis = basis_of_size(len(values))
+    if basis != "cube":
+        there = sample_coefficients(values, origin, voxel_size, points + 0.25 * voxel_size * normals)
+        return np.asarray(evaluate(basis, there, normals), np.float32)
     texel, weight = _corners(values.shape[1:4], origin, voxel_size, points + 0.25 * voxel_size * normals)
     texels = values.reshape(-1, values.shape[4])
     total = np.zeros((len(points), values.shape[4]), np.float32)

@@ -8,39 +8,36 @@
 //
 // The sums are kept by channel: a weight vector times a scalar is one instruction for eight coefficients, where a colour times a scalar
 // is one for three. Weights lie as tightly as they can, since reading them is most of what this pass does: a vector's last components
-// are then the next factor's first, whose sums nobody reads, and behind the last factor lies padding.
+// are then the next factor's first, whose sums nobody reads, and behind the last factor lies padding. A ninth coefficient would need a
+// whole vector more for each channel, so it is kept apart, as a colour.
 //
-// Defines: BASIS_SIZE, coefficients per channel (6: the ambient cube); WEIGHT_VECTORS, how many float4 a factor's weights touch.
+// Defines: BASIS_SIZE, coefficients per channel: 4, 6 (the ambient cube) or 9.
 #ifndef BASIS_SIZE
 #error "BASIS_SIZE is not defined"
 #endif
-#ifndef WEIGHT_VECTORS
-#error "WEIGHT_VECTORS is not defined"
-#endif
 
-// A factor's weights start wherever the last one's end.
-#if WEIGHT_VECTORS == 2
-typedef float8 weights_t;
-#define SUMS 1
-#define COMPONENTS 8
-#else
+#if BASIS_SIZE == 4
 typedef float4 weights_t;
-#define SUMS WEIGHT_VECTORS
-#define COMPONENTS 4
+#else
+typedef float8 weights_t;
 #endif
+// A factor's weights start wherever the last one's end.
 typedef weights_t loose_weights_t __attribute__((aligned(4)));
+#define IN_VECTOR (BASIS_SIZE == 9 ? 8 : BASIS_SIZE)
 
-#define ADD_FACTOR(f, red, green, blue)                                                                   \
-    {                                                                                                     \
-        __global const float *source = (__global const float *)(exitance + factor_source[f]);             \
-        __attribute__((opencl_unroll_hint(SUMS)))                                                         \
-        for (int v = 0; v < SUMS; ++v) {                                                                  \
-            const weights_t weight =                                                                      \
-                *(__global const loose_weights_t *)(factor_weight + (f) * BASIS_SIZE + v * COMPONENTS);   \
-            red[v] += weight * source[0];                                                                 \
-            green[v] += weight * source[1];                                                               \
-            blue[v] += weight * source[2];                                                                \
-        }                                                                                                 \
+#if BASIS_SIZE == 9
+#define ADD_LAST(f, source, last) last += factor_weight[(f) * BASIS_SIZE + 8] * *(__global const float4 *)source;
+#else
+#define ADD_LAST(f, source, last)
+#endif
+#define ADD_FACTOR(f, red, green, blue, last)                                                                     \
+    {                                                                                                             \
+        __global const float *source = (__global const float *)(exitance + factor_source[f]);                     \
+        const weights_t weight = *(__global const loose_weights_t *)(factor_weight + (f) * BASIS_SIZE);           \
+        red += weight * source[0];                                                                                \
+        green += weight * source[1];                                                                              \
+        blue += weight * source[2];                                                                               \
+        ADD_LAST(f, source, last)                                                                                 \
     }
 
 __kernel void gather_probes(
@@ -54,27 +51,29 @@ __kernel void gather_probes(
     const uint probe = get_global_id(0);
     if (probe >= probes)
         return;
-    weights_t red[SUMS], green[SUMS], blue[SUMS], odd_red[SUMS], odd_green[SUMS], odd_blue[SUMS];
-    __attribute__((opencl_unroll_hint(SUMS)))
-    for (int v = 0; v < SUMS; ++v)
-        red[v] = green[v] = blue[v] = odd_red[v] = odd_green[v] = odd_blue[v] = (weights_t)(0.0f);
+    weights_t red = 0.0f, green = 0.0f, blue = 0.0f, odd_red = 0.0f, odd_green = 0.0f, odd_blue = 0.0f;
+#if BASIS_SIZE == 9
+    float4 last = 0.0f, odd_last = 0.0f;
+#endif
     const uint end = factor_starts[probe + 1];
     uint f = factor_starts[probe];
     for (; f + 1 < end; f += 2) {
-        ADD_FACTOR(f, red, green, blue)
-        ADD_FACTOR(f + 1, odd_red, odd_green, odd_blue)
+        ADD_FACTOR(f, red, green, blue, last)
+        ADD_FACTOR(f + 1, odd_red, odd_green, odd_blue, odd_last)
     }
     if (f < end)
-        ADD_FACTOR(f, red, green, blue)
-    __attribute__((opencl_unroll_hint(SUMS)))
-    for (int v = 0; v < SUMS; ++v) {
-        red[v] += odd_red[v];
-        green[v] += odd_green[v];
-        blue[v] += odd_blue[v];
-    }
+        ADD_FACTOR(f, red, green, blue, last)
+    red += odd_red;
+    green += odd_green;
+    blue += odd_blue;
     // Private arrays of floats: the one way to index a vector by a variable.
-    const float *r = (const float *)red, *g = (const float *)green, *b = (const float *)blue;
-    __attribute__((opencl_unroll_hint(BASIS_SIZE)))
-    for (int i = 0; i < BASIS_SIZE; ++i)
+    const float *r = (const float *)&red, *g = (const float *)&green, *b = (const float *)&blue;
+    __attribute__((opencl_unroll_hint(IN_VECTOR)))
+    for (int i = 0; i < IN_VECTOR; ++i)
         probe_cube[probe * BASIS_SIZE + i] = (float4)(r[i], g[i], b[i], 0.0f);
+#if BASIS_SIZE == 9
+    last += odd_last;
+    last.w = 0.0f;
+    probe_cube[probe * BASIS_SIZE + 8] = last;
+#endif
 }

@@ -22,7 +22,7 @@
 #define SHADOW_TAPS 4
 #define SHADOW_ROW_TEXELS 1040
 
-// How much of one row of the probes' cubes a brick sends on, per channel. row : ROW_ONE + probe * 6 + face.
+// How much of one row of the probes' light a brick sends on, per channel. row : ROW_ONE + probe * coefficients, and of the cube + face.
 typedef struct {
     float albedo[3];
     uint row;

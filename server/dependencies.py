@@ -70,7 +70,9 @@ class VolumeFormatQuery(StrictQuery):
 
 class VolumeQuery(PositionQuery, VolumeFormatQuery):
     kind: Literal["outdoor"] = "outdoor"
-    basis: Literal["cube"] = "cube"
+    basis: Literal["cube", "sh1", "sh2"] = Field(
+        "cube", description="cube: +X -X +Y -Y +Z -Z; harmonics: 4 or 9 coefficients, where `/v1/world` says that they can be had"
+    )
     cascade: int = Field(0, ge=0, le=0, description="0: 32 x 16 x 32 voxels of 3.125 m")
 
 

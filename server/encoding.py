@@ -13,7 +13,7 @@ ArrayFormat = Literal["npy", "raw"]
 RawEncoding = Literal["f16"]
 
 # Changes whenever the bytes of a reply change for the same data; part of every ETag.
-REPLY_VERSION = 2
+REPLY_VERSION = 3
 
 HALF_MAX = 65504.0
 _HALF_ONE = np.uint16(0x3C00)
@@ -34,7 +34,7 @@ def half_scale(values: Float32) -> float:
     A power of two leaves mantissas alone, so the error is the half's own (2^-11); the values then span 2^15 down to 2^-14, 29 stops
     below the brightest, before precision falls. A texture of zeros has scale 1.
     """
-    peak = float(values.max(initial=0.0))
+    peak = max(float(values.max(initial=0.0)), -float(values.min(initial=0.0)))  # harmonics have a sign
     if peak <= 0:
         return 1.0
     return float(2.0 ** np.ceil(np.log2(peak / HALF_MAX)))

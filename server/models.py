@@ -114,6 +114,7 @@ class WorldReply(BaseModel):
     time: str = Field(description="what `time` may be")
     voxel_size_m: float
     volume_shape: tuple[int, int, int] = Field(description="y, z, x")
+    bases: list[str] = Field(description="what `basis` of a volume may be: the bake's, those poorer than it, and cube, the default")
     rooms: list[RoomReply]
     limits: LimitsReply
     dataset: dict[str, Any] = Field(description="digest, preset, basis, settings, counts and error report of the bake")

@@ -211,7 +211,8 @@ class Ticker:
     def _make_light(self, lighting: Lighting, state: LiveState) -> LiveLight:
         settings = state.settings
         gained = settings.light(lighting)
-        given = relight_input(gained, self.world.dataset.world.sun_table)
+        world = self.world.dataset.world
+        given = relight_input(gained, world.sun_table, world.sky, world.sky_patches)
         # Which lamps are on changes with the minute and with the sun: the same tuples otherwise, which sectors know at a glance.
         key = (state.lamps, lighting.time[:16], bool(lighting.sun.direction[1] > 0), settings.lights_factor)
         if key != self._lit_lamps:

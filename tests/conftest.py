@@ -12,6 +12,7 @@ from bake_jobs.geometry_clip import SectorCutter
 from bake_jobs.scene import Scene
 from bake_jobs.sector_job import SectorBaker
 from bake_jobs.solids import boxes
+from gi_core.basis import basis_of_size, factor_shares
 from gi_core.grid import SectorIndex
 from gi_core.sector import Sector, starts
 
@@ -60,6 +61,7 @@ def random_sector(
         weight[:, face] /= np.maximum(total, 1)[probe_of_factor]
     if basis != 6:
         weight *= rng.choice([-1, 1], weight.shape)
+        weight /= factor_shares(basis_of_size(basis))
     shape = (4, 20, 20)
     voxel_weight = rng.uniform(0, 1, (*shape, voxel_probes))
     feedback_weight = rng.uniform(0.1, 1, (surfels, feedback))

@@ -19,8 +19,10 @@ router = APIRouter(prefix="/v1", tags=["light"])
 def volume(request: Request, service: ServiceDep, query: Annotated[VolumeQuery, Query()]) -> Response:
     """Irradiance [lx] in the 32 x 16 x 32 voxels around a point, snapped to the world's lattice.
 
-    `npy`: float32 (6, 16, 32, 32, 3) = face +X -X +Y -Y +Z -Z, y, z, x, channel.
-    `raw`: little-endian halves (6, 16, 32, 32, 4); lux = rgb x scale; alpha is 1 in free air, else 0.
+    `npy`: float32 (B, 16, 32, 32, 3) = coefficient, y, z, x, channel.
+    `raw`: little-endian halves (B, 16, 32, 32, 4); lux = rgb x scale; alpha is 1 in free air, else 0.
+    `basis=cube`: B = 6 faces +X -X +Y -Y +Z -Z. `sh1`, `sh2`: B = 4, 9 of real spherical harmonics in the order 1, y, z, x, xy, yz,
+    3z^2-1, xz, x^2-y^2, of either sign; irradiance along a normal is their sum, each times its harmonic there.
     `mask=1`: uint8 (16, 32, 32), 0 solid, 1 outdoors, 2 indoors, 3 no sector there. The header `Gi-Volume` places it in the world.
     """
     laps = Laps()
@@ -30,7 +32,7 @@ def volume(request: Request, service: ServiceDep, query: Annotated[VolumeQuery, 
 
     def compute() -> Body:
         with laps.lap("relight"):
-            found = service.engine.volume(query.position, light)
+            found = service.engine.volume(query.position, light, basis=query.basis)
         with laps.lap("encode"):
             return mask_body(found, query) if query.mask else light_body(found, query)
 

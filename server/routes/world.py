@@ -4,6 +4,7 @@ from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
 
+from gi_core.basis import served_from
 from gi_core.constants import MAX_PROBES_PER_SECTOR, SECTOR_SIZE_M, VOLUME_SHAPE, VOXEL_SIZE_M
 from gi_core.dataset import WorldInfo
 from gi_core.weather import WEATHER_RANGES, weather_presets
@@ -47,6 +48,7 @@ def world_reply(info: WorldInfo, digest: str) -> WorldReply:
         time="HH:MM, or ISO 8601 local time with a date",
         voxel_size_m=VOXEL_SIZE_M,
         volume_shape=VOLUME_SHAPE,
+        bases=list(served_from(info.basis)),
         rooms=[RoomReply(name=room.name, minimum=room.minimum, maximum=room.maximum) for room in info.rooms],
         limits=LimitsReply(probe_radius_m=MAX_PROBE_RADIUS_M, preview_width=MAX_PREVIEW_WIDTH, probes_per_sector=MAX_PROBES_PER_SECTOR),
         dataset={
@@ -54,6 +56,8 @@ def world_reply(info: WorldInfo, digest: str) -> WorldReply:
             "source": info.source,
             "preset": info.preset,
             "basis": info.basis,
+            "sky": info.sky,
+            "sky_patches": info.sky_patches,
             "settings": info.settings,
             "counts": info.counts,
             "error_report": info.error_report,

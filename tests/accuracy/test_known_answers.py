@@ -1,13 +1,14 @@
 """Bake, then relight: scenes whose light can be written down. No path tracer; the whole chain but HTTP."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
-from bake_jobs.sector_job import SKY_FACES
+from bake_jobs.config import BakeSettings, settings_for
 from gi_core import relight_twin, sector_file
 from gi_core.ambient_cube import project_radiance
+from gi_core.basis import FEEDBACK, conversion
 from gi_core.constants import ALBEDO_MAX, SKY_SHAPE, VOXEL_INDOORS, VOXEL_SOLID
 from gi_core.device import shared_device
 from gi_core.lighting import DirectionalLight, Lighting
@@ -44,16 +45,21 @@ class Lit:
     """The relighter under test, on this machine's device."""
 
     sector: Sector
+    settings: BakeSettings
 
     def __post_init__(self):
-        self.resident = ResidentSector(shared_device(None), self.sector, SKY_FACES)
+        self.resident = ResidentSector(shared_device(None), self.sector, self.settings.sky_sources)
         self.relighter = Relighter(self.resident.device)
 
     def given(self, lighting: Lighting) -> RelightInput:
-        return relight_input(lighting, TABLE)
+        return relight_input(lighting, TABLE, self.settings.sky, self.settings.sky_sources)
+
+    def light(self, lighting: Lighting):
+        return self.relighter.converge(self.resident, self.given(lighting)).cubes
 
     def cubes(self, lighting: Lighting):
-        return self.relighter.converge(self.resident, self.given(lighting)).cubes
+        """What the basis says of the six faces: (P, 6, 3) [lx]."""
+        return np.einsum("fb,pbc->pfc", conversion(self.settings.basis, "cube"), self.light(lighting))
 
 
 @pytest.fixture(scope="module")
@@ -61,10 +67,22 @@ def light(bake_arrays):
     """Bake a scene's sector, write and read it as a file, and make it ready to be lit."""
 
     def light_scene(scene, index=(0, 0), **settings) -> Lit:
+        chosen = replace(settings_for("talk"), **settings)
         sector, _ = bake_arrays(scene, index, sun_directions=TABLE.directions, **settings)
-        return Lit(sector_file.quantised(sector, SKY_FACES))
+        return Lit(sector_file.quantised(sector, chosen.sky_sources), chosen)
 
     return light_scene
+
+
+# Every known answer that is no matter of the 2016 method's own errors must hold with each of the later ideas.
+MODES = {
+    "talk": {},
+    "patches": {"sky": "patches", "sky_patches": 24},
+    "feedback": {"feedback_probes": 6},
+    "sh1": {"basis": "sh1"},
+    "standard": {"basis": "sh2", "sky": "patches", "feedback_probes": 6},
+}
+in_all_modes = pytest.mark.parametrize("mode", MODES.values(), ids=MODES)
 
 
 def furnace(build, albedo, emission):
@@ -73,10 +91,11 @@ def furnace(build, albedo, emission):
     return build().box(low, high, albedo, emission, inward=True).scene(rooms=(room,))
 
 
+@in_all_modes
 @pytest.mark.parametrize("albedo", [0.0, 0.5, 0.9])
-def test_a_closed_white_furnace_converges_to_emission_over_one_minus_albedo(build, light, albedo):
+def test_a_closed_white_furnace_converges_to_emission_over_one_minus_albedo(build, light, albedo, mode):
     emission = np.array([100.0, 40.0, 7.0])
-    lit = light(furnace(build, albedo, emission))
+    lit = light(furnace(build, albedo, emission), **mode)
     cubes = lit.cubes(uniform_sky(5000.0))[lit.sector.probe_room == 1]  # closed: no sky comes in
     expected = np.pi * emission / (1 - albedo)
     assert len(cubes) >= 12
@@ -86,14 +105,34 @@ def test_a_closed_white_furnace_converges_to_emission_over_one_minus_albedo(buil
     np.testing.assert_allclose(voxels, np.broadcast_to(expected, voxels.shape), rtol=ONE_PERCENT)
 
 
-def test_an_albedo_of_one_is_clamped_and_converges(build, light):
-    lit = light(furnace(build, 1.0, 10.0))
+@in_all_modes
+def test_an_albedo_of_one_is_clamped_and_converges(build, light, mode):
+    lit = light(furnace(build, 1.0, 10.0), **mode)
     assert lit.sector.surfel_albedo.max() <= ALBEDO_MAX + 1e-6
     found = lit.relighter.converge(lit.resident, lit.given(uniform_sky()))
     assert found.residual <= 1e-5
-    indoors = found.cubes[lit.sector.probe_room == 1]
+    indoors = lit.cubes(uniform_sky())[lit.sector.probe_room == 1]
     # Albedo is stored in 8 bits of its root: 0.95 may be read as 0.9461, which moves 1 / (1 - albedo) by 7 %.
-    np.testing.assert_allclose(indoors, np.pi * 10.0 / (1 - ALBEDO_MAX), rtol=0.08)
+    most = FEEDBACK[lit.settings.basis].albedo_max
+    np.testing.assert_allclose(indoors, np.pi * 10.0 / (1 - most), rtol=0.08)
+
+
+@in_all_modes
+def test_light_in_a_closed_white_room_only_ever_falls(build, light, mode):
+    """Signs at random at first, which no light has: the most that harmonics' negative lobes can do."""
+    lit = light(furnace(build, 1.0, 0.0), **mode)
+    start = np.random.default_rng(0).normal(0, 1e4, (lit.sector.probe_count, lit.sector.basis_size, 3)).astype(np.float32)
+    lit.resident.write_cubes(start)
+    lit.relighter.relight([lit.resident], lit.given(uniform_sky()), 1)
+    before = np.abs(lit.resident.read_cubes()).max()
+    for _ in range(12):
+        lit.relighter.relight([lit.resident], lit.given(uniform_sky()), 10)
+        after = np.abs(lit.resident.read_cubes()).max()
+        assert after <= before * FEEDBACK[lit.settings.basis].shrinks ** 10
+        before = after
+    lit.relighter.relight([lit.resident], lit.given(uniform_sky()), 4000)
+    # Below that float32 has no normal numbers, and some devices round the last of the others up for ever.
+    assert np.abs(lit.resident.read_cubes()).max() < np.finfo(np.float32).tiny
 
 
 def view_factors(centre, normal, area):
@@ -165,16 +204,18 @@ def test_a_room_with_one_bright_patch_against_a_radiosity_solve(build, light, al
     assert cubes.mean() / truth.mean() == pytest.approx(1, abs=bias)
 
 
+@pytest.mark.parametrize("mode", ["talk", "patches", "standard"])
 @pytest.mark.parametrize("albedo", [0.0, 0.3, 0.8])
-def test_an_open_plain_under_a_uniform_sky(build, light, albedo):
+def test_an_open_plain_under_a_uniform_sky(build, light, albedo, mode):
     radiance = np.array([1000.0, 2000.0, 500.0])
     # 200 km wide: the ground fills the lower half of the view but for its last 0.001 %.
-    lit = light(build().ground(low=(-1e5, -1e5), high=(1e5, 1e5), albedo=albedo).scene())
+    lit = light(build().ground(low=(-1e5, -1e5), high=(1e5, 1e5), albedo=albedo).scene(), **MODES[mode])
     cubes = lit.cubes(uniform_sky(radiance))
     stored = float(np.unique(lit.sector.surfel_albedo)[0])
     assert stored == pytest.approx(albedo, abs=0.004)  # 8 bits of its root
     sky = np.pi * radiance
-    tolerance = {"rtol": ONE_PERCENT, "atol": 1e-6}
+    # Half a sphere of light has no second band, but 1536 rays see a little of one, and codes of 7 bits keep it.
+    tolerance = {"rtol": ONE_PERCENT, "atol": 1e-6 if mode != "standard" else 0.005 * sky.max()}
     np.testing.assert_allclose(cubes[:, UP], np.broadcast_to(sky, (len(cubes), 3)), **tolerance)
     np.testing.assert_allclose(cubes[:, DOWN], np.broadcast_to(albedo * sky, (len(cubes), 3)), **tolerance)
     side = sky / 2 * (1 + albedo)
@@ -197,13 +238,14 @@ def two_rooms(build, wall_x):
 
 # On the edges of 4 m bricks, within them, and on the edges of 1 m cells.
 @pytest.mark.parametrize("wall_x", [24.0, 21.7, 26.45, 22.0])
-def test_behind_a_closed_door_dark_stays_dark(build, light, wall_x):
-    lit = light(two_rooms(build, wall_x))
+@pytest.mark.parametrize("mode", ["talk", "standard"])
+def test_behind_a_closed_door_dark_stays_dark(build, light, wall_x, mode):
+    lit = light(two_rooms(build, wall_x), **MODES[mode])
     s = lit.sector
     cubes = lit.cubes(uniform_sky())
     west, east = cubes[s.probe_room == 1], cubes[s.probe_room == 2]
     assert min(len(west), len(east)) >= 4
-    assert west.min() > 100.0
+    assert west.min() > (100.0 if mode == "talk" else 0.0)
     assert east.max() <= 1e-3 * west.mean()
     voxels = relight_twin.blend_voxels(s, cubes)
     bright, dark = (voxels[(s.voxel_room == room) & (s.voxel_class != VOXEL_SOLID)] for room in (1, 2))

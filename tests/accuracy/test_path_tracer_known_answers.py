@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bake_jobs.irradiance_basis import sh2, sh2_weights
 from bake_jobs.path_tracer import Estimate, PathTracer, sky_radiance
+from gi_core.basis import harmonics, projection_weights
 from gi_core.errors import InputError
 from gi_core.lighting import DirectionalLight, Lighting
 
@@ -211,11 +211,11 @@ def test_sh2_is_exact_for_radiance_of_degree_two(sphere_directions):
     # A radiance of degree <= 2 is its own projection; its irradiance is the cosine convolution, summed here by brute force.
     coefficients = np.array([1.0, 0.3, -0.2, 0.1, 0.15, -0.1, 0.05, 0.2, -0.12])
     solid_angle = 4 * np.pi / len(sphere_directions)
-    radiance = sh2(sphere_directions) @ coefficients
-    projected = sh2_weights(sphere_directions).T @ radiance * solid_angle
+    radiance = harmonics(sphere_directions) @ coefficients
+    projected = projection_weights("sh2", sphere_directions).T @ radiance * solid_angle
     normals = sphere_directions[::997]
     brute_force = np.maximum(normals @ sphere_directions.T, 0) @ radiance * solid_angle
-    np.testing.assert_allclose(sh2(normals) @ projected, brute_force, atol=2e-4)  # lattice of 20 000 directions, mean 0.9
+    np.testing.assert_allclose(harmonics(normals) @ projected, brute_force, atol=2e-4)  # lattice of 20 000 directions, mean 0.9
 
 
 @pytest.fixture(scope="module")

@@ -8,9 +8,8 @@ import pytest
 from bake_jobs import factors, gbuffer, surfels
 from bake_jobs.gbuffer import cube_map_pattern
 from bake_jobs.rays import RayScene
-from bake_jobs.sector_job import SKY_FACES
 from bake_jobs.surfels import KEY_OFFSET_M, principal_direction
-from gi_core.constants import BRICK_CELL_M, MAX_BRICK_LEVEL
+from gi_core.constants import BRICK_CELL_M, CUBE_FACES, MAX_BRICK_LEVEL
 from gi_core.sector import check_sector, counts
 from gi_core.world import Room
 
@@ -89,7 +88,7 @@ def test_factor_sources_ascend_within_a_probe_and_sky_feeds_its_own_face_only(to
     for probe in range(town.seen.probes):
         source = gathered.source[gathered.starts[probe] : gathered.starts[probe + 1]].astype(int)
         assert (np.diff(source) > 0).all()
-    assert gathered.source.max() < bricks + SKY_FACES
+    assert gathered.source.max() < bricks + len(CUBE_FACES)
     for source, weight in zip(gathered.source, gathered.weight, strict=True):
         if source >= bricks:
             assert list(np.flatnonzero(weight)) == [source - bricks]
@@ -276,7 +275,7 @@ def test_baked_arrays_hold_every_invariant_of_a_sector(build, bake_arrays):
     scene = build().ground().box((8, 0, 8), (20, 10, 20), 0.99).box((40, 0, 12), (52, 30, 40), 0.7, emission=500.0).scene()
     for index in ((0, 0), (-1, -1), (2, 1)):
         sector, meta = bake_arrays(scene, index, rays_per_face_edge=8)
-        check_sector(sector, SKY_FACES)
+        check_sector(sector, len(CUBE_FACES))
         assert sector.surfel_albedo.max() <= np.float32(0.95)
         assert meta["probes"] == sector.probe_count > 100
         assert (counts(sector.brick_starts) > 0).all()

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gi_core.basis import evaluate
 from gi_core.device import shared_device
 from gi_core.errors import InputError
 from gi_core.lighting import DirectionalLight, Lighting
@@ -77,6 +78,17 @@ def test_ambient_colours_reach_their_faces_and_rooms():
     np.testing.assert_allclose(outdoors[3], (0, 2, 0))
     np.testing.assert_allclose(outdoors[0], (2, 1, 0))
     np.testing.assert_allclose(indoors, outdoors / 4)
+
+
+def test_ambient_colours_are_the_same_light_in_harmonics():
+    settings = Settings(ambient_up=(8, 0, 2), ambient_down=(0, 4, 1))
+    dark = np.zeros((1, 9, 3), np.float32)
+    light = settings.cubes(dark, dark, np.array([0], np.uint16))
+    normal = np.array([[0.6, 0.0, 0.8], [0.0, 1.0, 0.0], [0.0, 0.6, -0.8]], np.float32)
+    found = evaluate("sh2", np.repeat(light, 3, axis=0), normal)
+    # Between up and down it is their mean by height: 1/2 (1 + n_y) of up.
+    share = (1 + normal[:, 1:2]) / 2
+    np.testing.assert_allclose(found, share * settings.ambient_up + (1 - share) * settings.ambient_down, rtol=1e-5, atol=1e-5)
 
 
 def test_every_gain_at_its_maximum_stays_finite(lit):

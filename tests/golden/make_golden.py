@@ -15,7 +15,7 @@ import numpy as np
 from bake_jobs.config import BakeSettings, settings_for
 from bake_jobs.geometry_clip import SectorCutter
 from bake_jobs.scene import Mesh, Scene, join_meshes
-from bake_jobs.sector_job import SKY_FACES, SectorBaker
+from bake_jobs.sector_job import SectorBaker
 from bake_jobs.solids import boxes
 from gi_core import distant_file
 from gi_core.container import write_atomic
@@ -35,6 +35,8 @@ SETTINGS = replace(
     sun_hour_step_degrees=45.0,
     feedback_probes=2,
 )
+# Version 2 of world.json: harmonics, and a dome of patches.
+SETTINGS_V2 = replace(SETTINGS, basis="sh2", sky="patches", sky_patches=8)
 
 
 def tiny_scene() -> Scene:
@@ -86,7 +88,8 @@ def write_golden(folder: Path, settings: BakeSettings = SETTINGS, scene: Scene |
         bounds=scene.bounds,
         preset=settings.preset,
         basis=settings.basis,
-        sky_patches=SKY_FACES,
+        sky=settings.sky,
+        sky_patches=settings.sky_sources,
         settings=settings.to_json(),
         seed=0,
         sun_table=table,
@@ -101,4 +104,4 @@ def write_golden(folder: Path, settings: BakeSettings = SETTINGS, scene: Scene |
 
 if __name__ == "__main__":
     target = Path(__file__).parent / f"v{VERSION}"
-    print(target, write_golden(target).counts)
+    print(target, write_golden(target, SETTINGS_V2).counts)

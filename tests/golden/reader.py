@@ -49,6 +49,15 @@ def root(codes: np.ndarray) -> np.ndarray:
     return (codes / 255.0) ** 2
 
 
+def signed_root(codes: np.ndarray) -> np.ndarray:
+    return np.sign(codes) * (codes / 127.0) ** 2
+
+
+def harmonic_norms() -> np.ndarray:
+    """N of section 3."""
+    return np.sqrt(np.array([1, 3, 3, 3, 15, 15, 1.25, 15, 3.75]) / (4 * math.pi))
+
+
 def unit(codes: np.ndarray) -> np.ndarray:
     """(2, n) -> (n, 3), one vector at a time, as section 2 says it."""
     vectors = []
@@ -76,11 +85,13 @@ def read_sector(data: bytes) -> tuple[dict[str, Any], Arrays]:
     meta, a = read_container(data, "SECT")
     factor_starts, brick_starts = starts(a["factor_count"]), starts(a["brick_count"])
     bricks = len(a["brick_count"])
-    weight = np.zeros((len(a["factor_source"]), 6))
+    coefficients = len(a["factor_weight"])
+    weight = np.zeros((len(a["factor_source"]), coefficients))
+    decode, norms = (root, np.ones(6)) if coefficients == 6 else (signed_root, harmonic_norms()[:coefficients])
     for probe in range(len(a["factor_count"])):
         for f in range(factor_starts[probe], factor_starts[probe + 1]):
             kind = 0 if a["factor_source"][f] < bricks else 1
-            weight[f] = root(a["factor_weight"][:, f]) * a["factor_scale"][kind, :, probe].astype(np.float64)
+            weight[f] = decode(a["factor_weight"][:, f]) * a["factor_scale"][kind, :, probe].astype(np.float64) / norms
     position = np.zeros((brick_starts[-1], 3))
     for brick in range(bricks):
         for s in range(brick_starts[brick], brick_starts[brick + 1]):

@@ -20,10 +20,17 @@ from gi_core.dataset import Dataset
 from gi_core.engine import Engine
 from gi_core.sector import Sector
 
-GOLDEN = Path(__file__).parent / "v1"
-SECTORS = sorted((GOLDEN / "sectors").iterdir())
-GEOMETRIES = sorted((GOLDEN / "geometry").iterdir())
-DIGEST_OF_WHAT_V1_HOLDS = "f6b367f763c6b74747559c79e7d8c404"
+HERE = Path(__file__).parent
+# Of world.json's version: what the dataset of each holds, decoded.
+DIGESTS = {1: "f6b367f763c6b74747559c79e7d8c404", 2: "25302d021fc2a719939347ab066a472d"}
+GOLDEN = HERE / "v1"
+SECTORS = sorted(path for version in DIGESTS for path in (HERE / f"v{version}" / "sectors").iterdir())
+GEOMETRIES = sorted(path for version in DIGESTS for path in (HERE / f"v{version}" / "geometry").iterdir())
+each_version = pytest.mark.parametrize("golden", [HERE / f"v{version}" for version in DIGESTS], ids=lambda path: path.name)
+
+
+def name_of(path: Path) -> str:
+    return f"{path.parents[1].name}_{path.stem}"
 
 
 def neighbour(name: str) -> ModuleType:
@@ -47,18 +54,23 @@ def stored_arrays(path: Path) -> set[tuple[str, str, bool, int]]:
     return {(a["name"], a["dtype"], a["delta"], len(a["shape"])) for a in header["arrays"]}
 
 
-def test_the_golden_dataset_is_small_and_whole():
-    assert sum(path.stat().st_size for path in GOLDEN.rglob("*") if path.is_file()) < 60_000
-    assert [path.stem for path in SECTORS] == [path.stem for path in GEOMETRIES] == ["-1_0", "0_0"]
+@each_version
+def test_the_golden_dataset_is_small_and_whole(golden):
+    assert sum(path.stat().st_size for path in golden.rglob("*") if path.is_file()) < 75_000
+    for folder in ("sectors", "geometry"):
+        assert sorted(path.stem for path in (golden / folder).iterdir()) == ["-1_0", "0_0"]
 
 
 def test_every_golden_version_is_read_or_refused_by_name():
-    versions = sorted(int(path.name[1:]) for path in Path(__file__).parent.glob("v*") if path.is_dir())
+    versions = sorted(int(path.name[1:]) for path in HERE.glob("v*") if path.is_dir())
+    assert versions == list(DIGESTS)
     assert versions[-1] == dataset.VERSION, "a new format version needs its golden dataset: run make_golden.py"
-    assert {sector_file.VERSION, geometry_file.VERSION, distant_file.VERSION, dataset.VERSION} == {1}, "give tests of v2 what these have"
+    assert {sector_file.VERSION, geometry_file.VERSION, distant_file.VERSION} == {1}, "give tests of their v2 what these have"
+    for version in versions:
+        assert json.loads((HERE / f"v{version}" / "world.json").read_bytes())["version"] == version
 
 
-@pytest.mark.parametrize("path", SECTORS, ids=lambda p: p.stem)
+@pytest.mark.parametrize("path", SECTORS, ids=name_of)
 def test_a_sector_read_from_format_md_alone_is_the_sector(path):
     meta, expected = reader.read_sector(path.read_bytes())
     sector, bake = sector_file.read(path)
@@ -76,7 +88,7 @@ def test_a_sector_read_from_format_md_alone_is_the_sector(path):
             np.testing.assert_array_equal(found, values, err_msg=name)
 
 
-@pytest.mark.parametrize("path", GEOMETRIES, ids=lambda p: p.stem)
+@pytest.mark.parametrize("path", GEOMETRIES, ids=name_of)
 def test_geometry_read_from_format_md_alone_is_the_geometry(path):
     meta, expected = reader.read_geometry(path.read_bytes())
     geometry, index, bake_id = geometry_file.read(path)
@@ -87,29 +99,33 @@ def test_geometry_read_from_format_md_alone_is_the_geometry(path):
     np.testing.assert_array_equal(geometry.emission, expected["emission"])
 
 
-def test_distant_texels_read_from_format_md_alone_are_the_texels():
-    meta, expected = reader.read_distant((GOLDEN / "distant.gidist").read_bytes())
-    texels, bake_id = distant_file.read(GOLDEN / "distant.gidist")
+@each_version
+def test_distant_texels_read_from_format_md_alone_are_the_texels(golden):
+    meta, expected = reader.read_distant((golden / "distant.gidist").read_bytes())
+    texels, bake_id = distant_file.read(golden / "distant.gidist")
     assert (list(texels.origin), bake_id) == (meta["origin"], meta["bake_id"])
     np.testing.assert_array_equal(texels.sky, expected["sky"])
     np.testing.assert_array_equal(texels.valid, expected["valid"])
 
 
-def test_world_json_agrees_with_the_files_it_names():
-    world = json.loads((GOLDEN / "world.json").read_bytes())
+@each_version
+def test_world_json_agrees_with_the_files_it_names(golden):
+    world = json.loads((golden / "world.json").read_bytes())
     assert {f"{x},{z}" for x, z in ((-1, 0), (0, 0))} == set(world["sectors"])
     for key, facts in world["sectors"].items():
         name = key.replace(",", "_")
-        data = (GOLDEN / "sectors" / f"{name}.gisec").read_bytes()
+        data = (golden / "sectors" / f"{name}.gisec").read_bytes()
         meta, arrays = reader.read_sector(data)
         assert facts["bytes"] == len(data)
         assert facts["digest"] == hashlib.blake2b(data, digest_size=16).hexdigest()
-        assert facts["geometry_bytes"] == (GOLDEN / "geometry" / f"{name}.gigeo").stat().st_size
+        assert facts["geometry_bytes"] == (golden / "geometry" / f"{name}.gigeo").stat().st_size
         assert meta["bake"]["bake_id"] == world["bake_id"]
         assert len(arrays["probe_position"]) == facts["probes"]
         assert len(arrays["surfel_position"]) == facts["surfels"]
         assert arrays["voxel_class"].size == facts["voxels"]
         assert len(arrays["sun_visibility"]) == world["sun_table"]["planes"]
+        assert arrays["factor_weight"].shape[1] == {"cube": 6, "sh1": 4, "sh2": 9}[world["basis"]]
+        assert meta["sky_patches"] == world["sky_patches"]
     table = world["sun_table"]
     planes = reader.sun_plane_count(
         table["latitude_degrees"], table["north_degrees"], table["declination_step_degrees"], table["hour_angle_step_degrees"]
@@ -117,9 +133,10 @@ def test_world_json_agrees_with_the_files_it_names():
     assert planes == table["planes"]
 
 
-def test_what_version_1_holds_has_not_changed():
+@pytest.mark.parametrize("version", DIGESTS)
+def test_what_a_version_holds_has_not_changed(version):
     """The digest is over decoded integers and bit patterns of floats: decoding uses only IEEE operations that round one way."""
-    opened = Dataset.open(GOLDEN)
+    opened = Dataset.open(HERE / f"v{version}")
     h = hashlib.blake2b(digest_size=16)
     for index in sorted(opened.world.sectors):
         sector, geometry = opened.sector(index), opened.geometry(index)
@@ -130,32 +147,36 @@ def test_what_version_1_holds_has_not_changed():
     texels = opened.distant()
     h.update(texels.sky.tobytes() + texels.valid.tobytes())
     h.update(json.dumps(opened.world.to_json(), sort_keys=True).encode())
-    assert h.hexdigest() == DIGEST_OF_WHAT_V1_HOLDS
+    assert h.hexdigest() == DIGESTS[version]
 
 
-def test_the_golden_dataset_still_lights_a_street():
-    engine = Engine(Dataset.open(GOLDEN))
-    volume = engine.volume(np.array([5.0, 2.0, 30.0]), engine.lighting("12:00", "clear"))
+@each_version
+def test_the_golden_dataset_still_lights_a_street(golden):
+    engine = Engine(Dataset.open(golden))
+    volume = engine.volume(np.array([5.0, 2.0, 30.0]), engine.lighting("12:00", "clear"), basis="cube")
     assert volume.sectors == ((-1, 0), (0, 0))
     # A street in a spring noon: tens of thousands of lux from the sky and the ground, none of them negative.
     assert volume.values.min() >= 0
     assert 5e3 < float(np.median(volume.values[2, ..., 1])) < 5e4
 
 
-def test_a_dataset_made_today_is_described_by_format_md(tmp_path):
-    world = neighbour("make_golden").write_golden(tmp_path)
+@each_version
+def test_a_dataset_made_today_is_described_by_format_md(tmp_path, golden):
+    make = neighbour("make_golden")
+    world = make.write_golden(tmp_path, {"v1": make.SETTINGS, "v2": make.SETTINGS_V2}[golden.name])
+    assert json.loads((tmp_path / "world.json").read_bytes())["version"] == int(golden.name[1:])
     opened = Dataset.open(tmp_path)
     for index in world.sectors:
         path = opened.sector_path(index)
         _, arrays = reader.read_sector(path.read_bytes())
-        assert stored_arrays(path) == stored_arrays(GOLDEN / "sectors" / path.name), "another array, dtype or encoding is another version"
+        assert stored_arrays(path) == stored_arrays(golden / "sectors" / path.name), "another array, dtype or encoding is another version"
         sector = opened.sector(index)
         np.testing.assert_array_equal(arrays["voxel_probe"], sector.voxel_probe)
         np.testing.assert_array_equal(arrays["factor_source"], sector.factor_source)
         cut = dataset.geometry_path(tmp_path, index)
         reader.read_geometry(cut.read_bytes())
-        assert stored_arrays(cut) == stored_arrays(GOLDEN / "geometry" / cut.name)
-    assert stored_arrays(tmp_path / "distant.gidist") == stored_arrays(GOLDEN / "distant.gidist")
+        assert stored_arrays(cut) == stored_arrays(golden / "geometry" / cut.name)
+    assert stored_arrays(tmp_path / "distant.gidist") == stored_arrays(golden / "distant.gidist")
 
 
 def test_the_hexdump_in_format_md_is_the_golden_sector():

@@ -24,7 +24,7 @@ BAD: list[tuple[str, dict[str, str], str]] = [
     ("/v1/volume", {**GOOD, "format": "exe"}, "'npy' or 'raw'"),
     ("/v1/volume", {**GOOD, "format": "ktx2"}, "'npy' or 'raw'"),
     ("/v1/volume", {**GOOD, "format": "raw", "encoding": "rgb9e5"}, "'f16'"),
-    ("/v1/volume", {**GOOD, "basis": "sh2"}, "'cube'"),
+    ("/v1/volume", {**GOOD, "basis": "sh2"}, "baked in cube; expected cube, found sh2"),
     ("/v1/volume", {**GOOD, "cascade": "3"}, "cascade"),
     ("/v1/volume", {**GOOD, "kind": "interior"}, "'outdoor'"),
     ("/v1/volume", {**GOOD, "mask": "maybe"}, "mask"),

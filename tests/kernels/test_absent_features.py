@@ -55,7 +55,13 @@ def test_a_sector_under_the_sky_alone_has_nothing_else(fresh, make_sector):
         assert getattr(resident, absent) is None, absent
     assert {name for name, _ in fresh.built_kernels} == {"collect_bounces", "light_bricks", "bounce_bricks", "gather_probes"}
     assert defines_of(fresh, "light_bricks") == {"DIRECTIONAL_LIGHTS": 0} | dict.fromkeys(FEATURES, 0)
-    assert defines_of(fresh, "collect_bounces") == {"FEEDBACK_PROBES": 1, "HAS_FEEDBACK_WEIGHTS": 0, "HAS_SNOW": 0}
+    assert defines_of(fresh, "collect_bounces") == {
+        "BASIS_SIZE": 6,
+        "BOUNCE_ALBEDO_PERMILLE": 950,
+        "FEEDBACK_PROBES": 1,
+        "HAS_FEEDBACK_WEIGHTS": 0,
+        "HAS_SNOW": 0,
+    }
 
 
 def test_the_sun_alone_brings_its_own_buffers_and_no_shadow_map(fresh, make_sector):

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from gi_core import layout, pocl_cpu, relight_twin
+from gi_core.basis import convert
+from gi_core.constants import BASIS_SIZES
 from gi_core.device import Device, available_devices, choose_device, describe, shared_device
-from gi_core.errors import DeviceError, KernelBuildError
+from gi_core.errors import DeviceError, InputError, KernelBuildError
 from gi_core.layout import DIRECTIONAL_LIGHT
 from gi_core.relight import Relighter
 from gi_core.relight_input import RelightInput
@@ -25,7 +27,7 @@ def device(request) -> Device:
     return shared_device(request.param)
 
 
-def given_light(seed: int, lights: int, planes: int = 12, snow: float = 0.0) -> RelightInput:
+def given_light(seed: int, lights: int, planes: int = 12, snow: float = 0.0, patches: int = PATCHES) -> RelightInput:
     rng = np.random.default_rng(seed)
     records = np.zeros(lights, DIRECTIONAL_LIGHT.dtype)
     for record in records:
@@ -35,7 +37,7 @@ def given_light(seed: int, lights: int, planes: int = 12, snow: float = 0.0) -> 
         record["plane"] = rng.integers(0, planes, 4)
         weight = rng.uniform(0, 1, 4)
         record["plane_weight"] = weight / weight.sum()
-    return RelightInput(rng.uniform(0, 2e4, (PATCHES, 3)).astype(np.float32), records, snow)
+    return RelightInput(rng.uniform(0, 2e4, (patches, 3)).astype(np.float32), records, snow)
 
 
 SHAPES = [
@@ -44,6 +46,10 @@ SHAPES = [
     {"feedback": 4},
     {"probes": 1},
     {"probes": 1000, "surfels": 3000},
+    {"basis": 4},
+    {"basis": 9},
+    {"basis": 9, "feedback": 6, "patches": 32},
+    {"basis": 9, "probes": 1000, "surfels": 3000},
     {"surfels": 1},
     {"surfels": 0},
     {"probes": 0},
@@ -54,13 +60,14 @@ SHAPES = [
 @pytest.mark.parametrize("shape", SHAPES, ids=str)
 def test_three_passes_equal_the_twins(device, make_sector, shape, lights):
     sector = make_sector(7, **shape)
-    given = given_light(lights, lights)
-    resident = ResidentSector(device, sector, PATCHES)
-    start = np.random.default_rng(8).uniform(0, 1e4, (sector.probe_count, 6, 3)).astype(np.float32)
+    patches = shape.get("patches", PATCHES)
+    given = given_light(lights, lights, patches=patches)
+    resident = ResidentSector(device, sector, patches)
+    start = np.random.default_rng(8).uniform(0, 1e4, (sector.probe_count, sector.basis_size, 3)).astype(np.float32)
     resident.write_cubes(start)
     Relighter(device).relight([resident], given, 3)
     expected = relight_twin.relight(sector, given, start, 3)
-    peak = expected.max(initial=1e-9)
+    peak = np.abs(expected).max(initial=1e-9)
     np.testing.assert_allclose(resident.read_cubes() / peak, expected / peak, atol=CLOSE)
 
 
@@ -121,14 +128,17 @@ def test_two_sectors_in_one_call_equal_each_alone(device, make_sector):
         np.testing.assert_array_equal(resident.read_cubes(), alone.read_cubes())
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(8))
 def test_convergence_reaches_the_float64_solve(device, make_sector, seed):
-    sector = make_sector(seed, emits=seed % 2 == 1)
+    # Random harmonics are no light and may grow: weak ones are what a real sector has.
+    sector = make_sector(seed, emits=seed % 2 == 1, basis=6 if seed < 6 else 9, feedback=1 if seed < 6 else 3)
+    if seed >= 6:
+        sector = replace(sector, factor_weight=sector.factor_weight * np.float32(0.3))
     given = given_light(seed, seed % 3)
     found = Relighter(device).converge(ResidentSector(device, sector, PATCHES), given)
     truth = relight_twin.solve(sector, given)
     # The contract: within 1e-4 of the peak. The residual asked for is 1e-5.
-    assert np.abs(found.cubes - truth).max() <= 1e-4 * truth.max()
+    assert np.abs(found.cubes - truth).max() <= 1e-4 * np.abs(truth).max()
     assert found.residual <= 1e-5
 
 
@@ -158,15 +168,36 @@ def test_no_light_is_exactly_dark(device, make_sector):
     assert not Relighter(device).converge(ResidentSector(device, make_sector(11), PATCHES), dark).cubes.any()
 
 
-def test_a_volume_equals_the_twins_blend(device, make_sector):
-    sector = make_sector(12)
+@pytest.mark.parametrize(("source", "target"), [("sh2", "cube"), ("sh1", "cube"), ("sh2", "sh1"), ("cube", "cube"), ("sh2", "sh2")])
+def test_a_served_basis_equals_the_twins(device, make_sector, source, target):
+    sector = make_sector(18, basis=BASIS_SIZES[source])
     resident = ResidentSector(device, sector, PATCHES)
-    cubes = np.random.default_rng(12).uniform(0, 1e4, (sector.probe_count, 6, 3)).astype(np.float32)
+    light = np.random.default_rng(18).uniform(-1e4, 1e4, (sector.probe_count, sector.basis_size, 3)).astype(np.float32)
+    light[:, 0] = np.abs(light[:, 0])  # there is no less light than none on the whole
+    resident.write_cubes(light)
+    found = np.zeros((sector.probe_count, BASIS_SIZES[target], 4), np.float32)
+    device.read(resident.converted(target), found)
+    expected = convert(light, source, target)
+    np.testing.assert_allclose(found[..., :3], expected, atol=1e-6 * np.abs(expected).max())  # sums of nine in float32
+    if target == "cube" != source:
+        assert found.min() == 0
+
+
+def test_a_richer_basis_is_not_served(device, make_sector):
+    with pytest.raises(InputError, match="this light is in cube"):
+        ResidentSector(device, make_sector(18), PATCHES).converted("sh2")
+
+
+@pytest.mark.parametrize("basis", [4, 6, 9])
+def test_a_volume_equals_the_twins_blend(device, make_sector, basis):
+    sector = make_sector(12, basis=basis)
+    resident = ResidentSector(device, sector, PATCHES)
+    cubes = np.random.default_rng(12).uniform(0, 1e4, (sector.probe_count, basis, 3)).astype(np.float32)
     resident.write_cubes(cubes)
     box = next(b for b in plan_boxes(np.array([0, -1, 0])) if b.index == sector.index)
-    target = device.allocate(6 * 16 * 32 * 32 * 3 * 4)
+    target = device.allocate(basis * 16 * 32 * 32 * 3 * 4)
     resident.fill_volume(box_record(box, sector), tuple(int(n) for n in box.size), target)
-    values = np.zeros((6, 16, 32, 32, 3), np.float32)
+    values = np.zeros((basis, 16, 32, 32, 3), np.float32)
     device.read(target, values)
     expected = relight_twin.blend_voxels(sector, cubes)
     (nx, ny, nz) = box.size
@@ -198,7 +229,7 @@ def test_a_kernel_that_does_not_build_shows_the_compilers_words(device):
 
 def test_a_missing_define_stops_the_build(device):
     with pytest.raises(KernelBuildError, match="FEEDBACK_PROBES"):
-        device.kernel("collect_bounces", HAS_FEEDBACK_WEIGHTS=0, HAS_SNOW=0)
+        device.kernel("collect_bounces", BASIS_SIZE=6, BOUNCE_ALBEDO_PERMILLE=950, HAS_FEEDBACK_WEIGHTS=0, HAS_SNOW=0)
 
 
 @pytest.mark.parametrize(
