@@ -77,20 +77,22 @@ class LiveVolume:
         self._first, self._layout = first_voxel, None
         self.touched = tuple(box.index for box in plan_boxes(first_voxel) if box.index in known)
 
-    def fill(
-        self, tick: int, residents: Mapping[SectorIndex, LiveSector], shown: ShownCubes, placeholder: Callable[[SectorIndex], Float32]
-    ) -> PublishedVolume:
-        """Fill what has changed, and publish it."""
+    def enqueue(self, residents: Mapping[SectorIndex, LiveSector], shown: ShownCubes) -> None:
+        """Enqueue the filling of what has changed; ``publish`` must follow."""
         present = frozenset(i for i in self.touched if i in residents and residents[i].is_lit)
         fresh = self._layout is None or present != self._present
         if fresh:
             self._present, self._layout = present, _lay_out(self._first, residents, frozenset(self.touched), present)
-        layout = self._layout
-        assert layout is not None
-        for box, record in layout.boxes:
+        assert self._layout is not None
+        for box, record in self._layout.boxes:
             sector = residents[box.index]
             if fresh or sector.shown_at > self._filled_at:
                 sector.resident.fill_volume(record, tuple(int(n) for n in box.size), self._buffer, shown(sector), self.basis)
+
+    def publish(self, tick: int, placeholder: Callable[[SectorIndex], Float32]) -> PublishedVolume:
+        """Read what ``enqueue`` asked for, put placeholders in, and show it."""
+        layout = self._layout
+        assert layout is not None
         values = np.empty((BASIS_SIZES[self.basis], *VOLUME_SHAPE, 3), np.float32)
         self._device.read(self._buffer, values)
         for index, z, x in layout.placeholders:

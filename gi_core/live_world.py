@@ -47,6 +47,8 @@ from gi_core.volume import box_record, plan_boxes
 DEFAULT_BUDGET_BYTES = 512 << 20
 # A new player's first volume is held back until all of its sectors are lit, but not for longer than two seconds at 30 Hz.
 HELD_TICKS = 60
+# Volumes whose filling is enqueued before the first of them is read.
+FILLED_TOGETHER = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,20 +286,29 @@ class LiveWorld:
     def _fill(self, tick: int, light: LiveLight, report: TickReport, until: float) -> None:
         residents = self.streamer.residents
         filled: list[str] = []
-        held = 0
-        for name in sorted(self._stale, key=lambda name: (self._stale[name], name)):
-            if filled and time.perf_counter() >= until:
-                break
-            volume, arriving = self.volumes[name], self.volumes[name].published is None
-            if arriving and tick < self._stale[name] + HELD_TICKS and not all(map(self._is_lit, volume.touched)):
-                held += 1
-                continue
-            volume.fill(tick, residents, lambda sector: self._shown(sector, light), self._placeholder)
-            if arriving:
-                self._shown_to.update(volume.touched)
-            del self._stale[name]
-            filled.append(name)
-        report.filled, report.waiting = tuple(filled), len(self._stale) - held
+        held: list[str] = []
+        waiting = sorted(self._stale, key=lambda name: (self._stale[name], name))
+        while waiting and (not filled or time.perf_counter() < until):
+            # The device fills some while this thread prepares the next and reads those before.
+            some, waiting = waiting[:FILLED_TOGETHER], waiting[FILLED_TOGETHER:]
+            held += [name for name in some if self._is_held(name, tick)]
+            some = [name for name in some if name not in held]
+            for name in some:
+                self.volumes[name].enqueue(residents, lambda sector: self._shown(sector, light))
+            for name in some:
+                volume = self.volumes[name]
+                arriving = volume.published is None
+                volume.publish(tick, self._placeholder)
+                if arriving:
+                    self._shown_to.update(volume.touched)
+                del self._stale[name]
+            filled += some
+        report.filled, report.waiting = tuple(filled), len(self._stale) - len(held)
+
+    def _is_held(self, name: str, tick: int) -> bool:
+        """Whether a new player's first volume waits for sectors that are on their way."""
+        volume = self.volumes[name]
+        return volume.published is None and tick < self._stale[name] + HELD_TICKS and not all(map(self._is_lit, volume.touched))
 
     def _shown(self, sector: LiveSector, light: LiveLight) -> cl.Buffer:
         return sector.shown(light.settings, lambda: self._placeholder(sector.resident.sector.index), self.basis)
