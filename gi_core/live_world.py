@@ -14,7 +14,6 @@ anybody's. No file is read and no kernel compiled in it, once ``warm_up`` has ru
 
 import threading
 import time
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import product
@@ -33,7 +32,8 @@ from gi_core.light_geometry import ShadowGeometry
 from gi_core.light_needs import WHOLLY, LightNeeds
 from gi_core.live_sector import BURST_CHANGE, BURST_PASSES, FIRST_PASSES, LiveLight, LiveSector
 from gi_core.live_shadows import LiveShadows
-from gi_core.live_volume import LiveVolume, PublishedVolume
+from gi_core.live_volume import PublishedVolume
+from gi_core.live_volumes import LiveVolumes
 from gi_core.relight import Relighter
 from gi_core.relight_input import RelightInput
 from gi_core.sector import Sector
@@ -45,10 +45,6 @@ from gi_core.tick_plan import PLACES, plan_tick
 from gi_core.volume import box_record, plan_boxes
 
 DEFAULT_BUDGET_BYTES = 512 << 20
-# A new player's first volume is held back until all of its sectors are lit, but not for longer than two seconds at 30 Hz.
-HELD_TICKS = 60
-# Volumes whose filling is enqueued before the first of them is read.
-FILLED_TOGETHER = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,24 +96,18 @@ class LiveWorld:
         Raises DeviceError, and InputError for a basis that the dataset cannot be served in.
         """
         self.dataset = dataset
-        self.volumes: dict[str, LiveVolume] = {}
         self.plan: StreamPlan | None = None
         self._device = Device(device)
         self._relighter = Relighter(self._device)
         self._places = places
         conversion(dataset.world.basis, basis)
         self.basis = basis
-        self._known = frozenset(dataset.world.sectors)
         self._geometry = ShadowGeometry(dataset.geometry, dataset.world.sectors)
         self._tracing = threading.Lock()
         self.streamer = Streamer(sector_table(dataset.world), dataset.sector, self._place, stream or StreamOptions(budget_bytes))
+        self.volumes = LiveVolumes(self._device, frozenset(dataset.world.sectors), self.streamer.residents, basis)
         self._needs = LightNeeds(len(self.streamer.table.sectors))
         self._row = {index: row for row, index in enumerate(self.streamer.table.sectors)}
-        self._firsts: dict[str, bytes] = {}
-        self._readers: dict[SectorIndex, set[str]] = {}
-        self._stale: dict[str, int] = {}
-        self._shown_to: Counter[SectorIndex] = Counter()
-        """How many published volumes read each sector, there or not."""
         self._light: LiveLight | None = None
         self._distant_sky = dataset.distant()
         self._shadows = LiveShadows(self._device, dataset) if shadow_map else None
@@ -131,11 +121,11 @@ class LiveWorld:
     def nbytes(self) -> int:
         """Bytes on the device: sectors, volumes, the shadow map."""
         residents = sum(sector.nbytes for sector in list(self.streamer.residents.values()))
-        return residents + sum(v.nbytes for v in list(self.volumes.values())) + (self._shadows.nbytes if self._shadows else 0)
+        return residents + self.volumes.nbytes + (self._shadows.nbytes if self._shadows else 0)
 
     def published(self, player: str) -> PublishedVolume | None:
         """A player's latest volume, from any thread; None before its first."""
-        volume = self.volumes.get(player)
+        volume = self.volumes.of_player.get(player)
         return None if volume is None else volume.published
 
     def tick(
@@ -163,15 +153,16 @@ class LiveWorld:
             for index in sampled:
                 self._needs.disturb(self._row[index], BURST_CHANGE)
         lap("shadow_map")
-        report.missing = tuple(index for index in self._shown_to if not self._is_lit(index))
+        report.missing = self.volumes.missing
         lit = set(report.relit) | set(report.settled)
         changed = list(report.evicted)
         for index, sector in self.streamer.residents.items():
-            sector.advance(tick, gains_changed or index in lit, index in self._shown_to)
+            sector.advance(tick, gains_changed or index in lit, index in self.volumes.looked_at)
             if sector.shown_at == tick:
                 changed.append(index)
-        self._note_readers(tick, players, changed)
-        self._fill(tick, light, report, started + fill_ms / 1e3)
+        self.volumes.note(tick, players.ids, players.positions, changed)
+        until_s = started + fill_ms / 1e3
+        report.filled, report.waiting = self.volumes.fill(tick, until_s, lambda sector: self._shown(sector, light), self._placeholder)
         lap("volumes")
         return report
 
@@ -246,69 +237,6 @@ class LiveWorld:
                 if residents[index].settle(self._relighter, light):
                     needs.relit(row, tick, light.vector, 0.0, exact=True)
                     report.settled = (index,)
-
-    def _note_readers(self, tick: int, players: TickPlayers, changed: Sequence[SectorIndex]) -> None:
-        """Find the volumes that have to be filled: of players who moved to other voxels, and those that read a changed sector."""
-        for gone in self.volumes.keys() - set(players.ids):
-            self._unread(gone, self.volumes.pop(gone))
-            self._stale.pop(gone, None)
-            del self._firsts[gone]
-        firsts = volume_first_voxel(players.positions)
-        for row, name in enumerate(players.ids):
-            place = firsts[row].tobytes()
-            if self._firsts.get(name) != place:
-                self._firsts[name] = place
-                volume = self.volumes.get(name)
-                if volume is None:
-                    volume = self.volumes[name] = LiveVolume(self._device, self.basis)
-                self._unread(name, volume)
-                volume.move(firsts[row], self._known)
-                for index in volume.touched:
-                    self._readers.setdefault(index, set()).add(name)
-                if volume.published is not None:
-                    self._shown_to.update(volume.touched)
-                self._stale.setdefault(name, tick)
-        for index in changed:
-            for name in self._readers.get(index, ()):
-                self._stale.setdefault(name, tick)
-
-    def _unread(self, name: str, volume: LiveVolume) -> None:
-        """A player's volume no longer reads what it read."""
-        for index in volume.touched:
-            self._readers[index].discard(name)
-        if volume.published is not None:
-            self._shown_to.subtract(volume.touched)
-            self._shown_to = +self._shown_to
-
-    def _is_lit(self, index: SectorIndex) -> bool:
-        return index in self.streamer.residents and self.streamer.residents[index].is_lit
-
-    def _fill(self, tick: int, light: LiveLight, report: TickReport, until: float) -> None:
-        residents = self.streamer.residents
-        filled: list[str] = []
-        held: list[str] = []
-        waiting = sorted(self._stale, key=lambda name: (self._stale[name], name))
-        while waiting and (not filled or time.perf_counter() < until):
-            # The device fills some while this thread prepares the next and reads those before.
-            some, waiting = waiting[:FILLED_TOGETHER], waiting[FILLED_TOGETHER:]
-            held += [name for name in some if self._is_held(name, tick)]
-            some = [name for name in some if name not in held]
-            for name in some:
-                self.volumes[name].enqueue(residents, lambda sector: self._shown(sector, light))
-            for name in some:
-                volume = self.volumes[name]
-                arriving = volume.published is None
-                volume.publish(tick, self._placeholder)
-                if arriving:
-                    self._shown_to.update(volume.touched)
-                del self._stale[name]
-            filled += some
-        report.filled, report.waiting = tuple(filled), len(self._stale) - len(held)
-
-    def _is_held(self, name: str, tick: int) -> bool:
-        """Whether a new player's first volume waits for sectors that are on their way."""
-        volume = self.volumes[name]
-        return volume.published is None and tick < self._stale[name] + HELD_TICKS and not all(map(self._is_lit, volume.touched))
 
     def _shown(self, sector: LiveSector, light: LiveLight) -> cl.Buffer:
         return sector.shown(light.settings, lambda: self._placeholder(sector.resident.sector.index), self.basis)

@@ -17,7 +17,8 @@ from gi_core.light_blend import LightVector
 from gi_core.lighting import Lighting
 from gi_core.lights import lamps_on
 from gi_core.live_sector import FADE_TICKS, LiveLight
-from gi_core.live_world import HELD_TICKS, LiveWorld, TickPlayers, TickReport
+from gi_core.live_volumes import HELD_TICKS
+from gi_core.live_world import LiveWorld, TickPlayers, TickReport
 from gi_core.relight_input import relight_input
 from gi_core.settings import NEUTRAL, Settings
 from gi_core.stream_plan import StreamOptions
@@ -92,7 +93,7 @@ class Run:
             return bool(loaded and is_exact(self.world) and not any(s.is_fading for s in residents.values()) and not report.filled)
 
         self.until(players, light, settled)
-        return self.world.volumes[players.ids[0]].published.values
+        return self.world.volumes.of_player[players.ids[0]].published.values
 
 
 @pytest.mark.parametrize("time_of_day", ["12:00", "23:30"])
@@ -102,7 +103,7 @@ def test_a_world_that_stands_still_shows_the_very_bytes_of_a_query(world, engine
     found = Run(world).settle(at(STREET), light_of(world, lighting, engine.lamps))
     query = engine.volume(STREET, lighting)
     np.testing.assert_array_equal(found, query.values)
-    np.testing.assert_array_equal(world.volumes["p0"].published.mask, query.mask)
+    np.testing.assert_array_equal(world.volumes.of_player["p0"].published.mask, query.mask)
 
 
 @pytest.mark.parametrize("basis", ["cube", "sh1", "sh2"])
@@ -116,7 +117,7 @@ def test_volumes_in_each_basis_are_the_very_bytes_of_a_query(basis, settings):
         lighting = engine.lighting("12:00", "clear")
         found = Run(world).settle(at(STREET), light_of(world, lighting, settings=settings))
         assert found.shape[0] == {"cube": 6, "sh1": 4, "sh2": 9}[basis]
-        assert world.volumes["p0"].published.basis == basis
+        assert world.volumes.of_player["p0"].published.basis == basis
         query = engine.volume(STREET, lighting, settings, basis=basis).values
         # Gains are applied in a kernel here, in NumPy there: float32 rounds either way.
         np.testing.assert_allclose(found, query, atol=0 if settings is NEUTRAL else 1e-6 * query.max())
@@ -178,7 +179,7 @@ def test_a_lamp_that_moves_is_followed_within_a_few_ticks(world, engine):
     light = light_of(world, lighting, (moved,), standing=False)
 
     def close(_: TickReport) -> bool:
-        return float(np.abs(world.volumes["p0"].published.values - goal).max()) <= 1e-3 * goal.max()
+        return float(np.abs(world.volumes.of_player["p0"].published.values - goal).max()) <= 1e-3 * goal.max()
 
     assert not close(TickReport(0))
     assert run.until(at(STREET), light, close) <= 5
@@ -190,7 +191,7 @@ def test_a_new_players_first_volume_waits_for_its_sectors(world, engine):
 
     def published(report: TickReport) -> bool:
         nonlocal first
-        first = world.volumes["p0"].published
+        first = world.volumes.of_player["p0"].published
         return first is not None
 
     assert run.until(at(STREET), light, published, pause_s=1 / 30) < HELD_TICKS
@@ -199,7 +200,7 @@ def test_a_new_players_first_volume_waits_for_its_sectors(world, engine):
     # What is shown first has its bounces: nothing is left to pop.
     for _ in range(30):
         run.tick(at(STREET), light)
-    late = world.volumes["p0"].published.values
+    late = world.volumes.of_player["p0"].published.values
     assert np.abs(late - first.values).max() <= 0.02 * late.max()
 
 
@@ -219,15 +220,15 @@ def test_nothing_pops_when_a_sector_arrives_late(tmp_path, engine):
         run, light = Run(world), light_of(world, engine.lighting("12:00", "clear"))
         # The other sector comes first only if it is asked for first.
         run.until(at(STREET + EAST * 30), light, lambda r: SectorIndex(0, 0) in world.streamer.residents)
-        run.until(at(STREET), light, lambda r: world.volumes["p0"].published is not None)
-        before = world.volumes["p0"].published
+        run.until(at(STREET), light, lambda r: world.volumes.of_player["p0"].published is not None)
+        before = world.volumes.of_player["p0"].published
         assert before.missing == (SectorIndex(-1, 0),)
         assert (before.values[:, :, :, :4] > 0).any()  # the placeholder, not darkness
         slow["hold"] = False
         frames = []
 
         def arrived(report: TickReport) -> bool:
-            frames.append(world.volumes["p0"].published.values)
+            frames.append(world.volumes.of_player["p0"].published.values)
             sector = world.streamer.residents.get(SectorIndex(-1, 0))
             return sector is not None and is_exact(world) and not sector.is_fading and not report.filled
 
@@ -251,11 +252,11 @@ def test_a_sector_that_cannot_be_read_leaves_the_distant_probe_and_is_tried_agai
     world = LiveWorld(Dataset.open(city), shadow_map=False)
     try:
         run, light = Run(world), light_of(world, engine.lighting("12:00", "clear"))
-        run.until(at(STREET), light, lambda r: world.streamer.failures and world.volumes["p0"].published)
+        run.until(at(STREET), light, lambda r: world.streamer.failures and world.volumes.of_player["p0"].published)
         failure = world.streamer.failures[SectorIndex(-1, 0)]
         assert failure.attempts >= 1
         assert "-1_0.gisec" in failure.reason
-        published = world.volumes["p0"].published
+        published = world.volumes.of_player["p0"].published
         assert published.missing == (SectorIndex(-1, 0),)
         assert np.isfinite(published.values).all()
         file.write_bytes(whole)
@@ -279,7 +280,7 @@ def test_the_budget_holds_while_a_player_walks_to_and_fro(engine):
             assert world.streamer.resident_bytes <= 1.5 * largest
             time.sleep(0.004)
         assert world.streamer.loads >= 1
-        assert np.isfinite(world.volumes["p0"].published.values).all()
+        assert np.isfinite(world.volumes.of_player["p0"].published.values).all()
     finally:
         world.close()
 
@@ -288,9 +289,9 @@ def test_players_share_sectors_and_leave_nothing_behind(world, engine):
     run, light = Run(world), light_of(world, engine.lighting("12:00", "clear"))
     run.settle(at(STREET, STREET + EAST * 3.2, STREET), light)
     assert len(world.streamer.residents) == 2
-    np.testing.assert_array_equal(world.volumes["p0"].published.values, world.volumes["p2"].published.values)
+    np.testing.assert_array_equal(world.volumes.of_player["p0"].published.values, world.volumes.of_player["p2"].published.values)
     run.tick(at(STREET), light)
-    assert list(world.volumes) == ["p0"]
+    assert list(world.volumes.of_player) == ["p0"]
 
 
 def test_warming_up_changes_no_light(world, engine):
@@ -328,6 +329,6 @@ def test_a_running_clock_is_followed(world, engine):
         run.tick(at(STREET), light)
         run.tick(at(STREET), light)
         expected = engine.volume(STREET, lighting).values
-        changes.append(np.abs(world.volumes["p0"].published.values - expected).max() / expected.max())
+        changes.append(np.abs(world.volumes.of_player["p0"].published.values - expected).max() / expected.max())
     # A minute a tick is 1800 x: a relight behind, two of which make up a volume's two sectors.
     assert np.median(changes) < 0.02

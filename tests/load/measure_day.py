@@ -38,7 +38,7 @@ def luminance(values: np.ndarray) -> np.ndarray:
 def staleness(live: Live, engine: Engine, name: str) -> dict[str, float | str]:
     """How far a player's volume is from the query at the tick that it was filled in."""
     ticker = live.ticker
-    published = ticker.world.volumes[name].published
+    published = ticker.world.volumes.of_player[name].published
     moment = ticker.state.clock.moment_at(ticker.tick)
     weather = ticker.state.weather.at(moment)
     query = engine.volume(published_centre(published.first_voxel), make_lighting(live.dataset.world.location, moment, weather))

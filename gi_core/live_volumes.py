@@ -1,0 +1,111 @@
+"""All players' volumes: which have to be filled, in which order, and which sectors somebody looks at.
+
+Found by what has changed, not by looking at everybody: a player who moved to other voxels, a sector whose light was changed, and the
+players whose volumes read it. A thousand players who stand in settled light cost nothing.
+"""
+
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+
+from gi_core.arrays import Float32, Float64
+from gi_core.device import Device
+from gi_core.grid import SectorIndex, volume_first_voxel
+from gi_core.live_sector import LiveSector
+from gi_core.live_volume import LiveVolume, ShownCubes
+
+# A new player's first volume is held back until all of its sectors are lit, but not for longer than two seconds at 30 Hz.
+HELD_TICKS = 60
+# Volumes whose filling is enqueued before the first of them is read.
+FILLED_TOGETHER = 4
+
+
+class LiveVolumes:
+    """The ticker's alone. ``residents`` is the streamer's, as it stands."""
+
+    def __init__(self, device: Device, known: frozenset[SectorIndex], residents: Mapping[SectorIndex, LiveSector], basis: str) -> None:
+        """``known`` : sectors of the world; ``basis`` : of all volumes."""
+        self.of_player: dict[str, LiveVolume] = {}
+        self.looked_at: Counter[SectorIndex] = Counter()
+        """How many published volumes read each sector, there or not."""
+        self._device, self._known, self._residents, self._basis = device, known, residents, basis
+        self._firsts: dict[str, bytes] = {}
+        self._readers: dict[SectorIndex, set[str]] = {}
+        self._stale: dict[str, int] = {}
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes on the device."""
+        return sum(volume.nbytes for volume in list(self.of_player.values()))
+
+    @property
+    def missing(self) -> tuple[SectorIndex, ...]:
+        """Sectors that published volumes read and that are not there, or not lit yet."""
+        return tuple(index for index in self.looked_at if not self._is_lit(index))
+
+    def note(self, tick: int, ids: Sequence[str], positions: Float64, changed: Sequence[SectorIndex]) -> None:
+        """Find what has to be filled: for players ``ids`` (p) at positions (p, 3) [m], and sectors that show something else now."""
+        for gone in self.of_player.keys() - set(ids):
+            self._unread(gone, self.of_player.pop(gone))
+            self._stale.pop(gone, None)
+            del self._firsts[gone]
+        firsts = volume_first_voxel(positions)
+        for row, name in enumerate(ids):
+            place = firsts[row].tobytes()
+            if self._firsts.get(name) != place:
+                self._firsts[name] = place
+                volume = self.of_player.get(name)
+                if volume is None:
+                    volume = self.of_player[name] = LiveVolume(self._device, self._basis)
+                self._unread(name, volume)
+                volume.move(firsts[row], self._known)
+                for index in volume.touched:
+                    self._readers.setdefault(index, set()).add(name)
+                if volume.published is not None:
+                    self.looked_at.update(volume.touched)
+                self._stale.setdefault(name, tick)
+        for index in changed:
+            for name in self._readers.get(index, ()):
+                self._stale.setdefault(name, tick)
+
+    def fill(
+        self, tick: int, until_s: float, shown: ShownCubes, placeholder: Callable[[SectorIndex], Float32]
+    ) -> tuple[tuple[str, ...], int]:
+        """Fill and publish volumes, those that waited longest first, at least some, until ``time.perf_counter`` says ``until_s``.
+
+        -> whose, and how many wait for another tick
+        """
+        filled: list[str] = []
+        held = 0
+        waiting = sorted(self._stale, key=lambda name: (self._stale[name], name))
+        while waiting and (not filled or time.perf_counter() < until_s):
+            # The device fills some while this thread prepares the next and reads those before.
+            group, waiting = waiting[:FILLED_TOGETHER], waiting[FILLED_TOGETHER:]
+            ready = [name for name in group if not self._is_held(name, tick)]
+            held += len(group) - len(ready)
+            for name in ready:
+                self.of_player[name].enqueue(self._residents, shown)
+            for name in ready:
+                volume = self.of_player[name]
+                if volume.published is None:
+                    self.looked_at.update(volume.touched)
+                volume.publish(tick, placeholder)
+                del self._stale[name]
+            filled += ready
+        return tuple(filled), len(self._stale) - held
+
+    def _unread(self, name: str, volume: LiveVolume) -> None:
+        """A player's volume no longer reads what it read."""
+        for index in volume.touched:
+            self._readers[index].discard(name)
+        if volume.published is not None:
+            self.looked_at.subtract(volume.touched)
+            self.looked_at = +self.looked_at
+
+    def _is_lit(self, index: SectorIndex) -> bool:
+        return index in self._residents and self._residents[index].is_lit
+
+    def _is_held(self, name: str, tick: int) -> bool:
+        """Whether a new player's first volume waits for sectors that are on their way."""
+        volume = self.of_player[name]
+        return volume.published is None and tick < self._stale[name] + HELD_TICKS and not all(map(self._is_lit, volume.touched))
