@@ -236,7 +236,9 @@ def bench_decode(device: Device, rounds: int = 30) -> Measurement:
 
 def run(device_name: str | None = None, quick: bool = False) -> list[Measurement]:
     """All measurements of this module on one device; ``quick`` ones are a look, not a result. Raises DeviceError."""
+    from gi_core import bench_basis  # which imports this module
+
     device = shared_device(device_name)
     if quick:
         return [bench_relight(device, 2), bench_volume(device, 10), bench_decode(device, 3)]
-    return [bench_relight(device), bench_volume(device), bench_decode(device), *bench_features(device)]
+    return [bench_relight(device), bench_volume(device), bench_decode(device), *bench_features(device), *bench_basis.run(device)]

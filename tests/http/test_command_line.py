@@ -111,7 +111,7 @@ def test_info_shows_the_dataset_and_a_sector(sectorlight: RunCommand, city: Path
 
 
 def test_presets_that_come_later_are_refused_before_anything_is_read(sectorlight: RunCommand, tmp_path: Path) -> None:
-    for quality in ("standard", "reference", "best"):
+    for quality in ("reference", "best"):
         done = sectorlight("bake", SOURCE, "-o", str(tmp_path / "out"), "--quality", quality)
         expect_refusal(done, quality, *PRESETS)
     assert not (tmp_path / "out").exists()
