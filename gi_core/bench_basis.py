@@ -39,8 +39,9 @@ def sector_in(basis: str, seed: int, feedback: int = 1) -> Sector:
 
 def bench_tick(device: Device, basis: str, feedback: int, rounds: int) -> Measurement:
     """One pass over two sectors. Baseline: the same of cubes, each surfel lit by its closest probe."""
-    sides = [_ticks(device, [sector_in(*side) for side in _seeds(basis, feedback)]), _ticks(device, [sector_in("cube", s) for s in _all()])]
-    found, cube = (1e3 * seconds for seconds in side_by_side(*sides, rounds))
+    measured = _ticks(device, [sector_in(basis, seed, feedback) for seed in range(ROTATION)])
+    baseline = _ticks(device, [sector_in("cube", seed) for seed in range(ROTATION)])
+    found, cube = (1e3 * seconds for seconds in side_by_side(measured, baseline, rounds))
     sizes = {"coefficients": BASIS_SIZES[basis], "feedback_probes": feedback}
     name = f"relight_{basis}_feedback_{feedback}"
     return Measurement(name, found, "ms", cube, cube / found, sizes, device.name, "cube, one feedback probe")
@@ -48,8 +49,8 @@ def bench_tick(device: Device, basis: str, feedback: int, rounds: int) -> Measur
 
 def bench_fill(device: Device, source: str, target: str, rounds: int) -> Measurement:
     """Filling a volume in one basis from sectors in another, which converts probes first. Baseline: the same of cubes."""
-    sides = [_fills(device, source, target), _fills(device, "cube", "cube")]
-    found, cube = (1e3 * seconds for seconds in side_by_side(*sides, rounds))
+    times = side_by_side(_fills(device, source, target), _fills(device, "cube", "cube"), rounds)
+    found, cube = (1e3 * seconds for seconds in times)
     sizes = {"bytes": BASIS_SIZES[target] * int(np.prod(VOLUME_SHAPE)) * 12, "conversion": conversion(source, target).size}
     return Measurement(f"volume_fill_{target}_of_{source}", found, "ms", cube, cube / found, sizes, device.name, "cube of cubes")
 
@@ -60,14 +61,6 @@ def run(device: Device, quick: bool = False) -> list[Measurement]:
     ticks = [bench_tick(device, basis, feedback, rounds) for basis in ("cube", "sh1", "sh2") for feedback in (1, STANDARD_FEEDBACK)]
     pairs = [(source, target) for source in ("sh1", "sh2") for target in served_from(source)]
     return [*ticks[1:], *(bench_fill(device, source, target, rounds) for source, target in pairs)]
-
-
-def _all() -> range:
-    return range(ROTATION)
-
-
-def _seeds(basis: str, feedback: int) -> list[tuple[str, int, int]]:
-    return [(basis, seed, feedback) for seed in _all()]
 
 
 def _ticks(device: Device, sectors: list[Sector]) -> Callable[[], None]:
