@@ -1,13 +1,26 @@
 """What a bake may trade. A preset is a set of values of these knobs; the file format knows none of them."""
 
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Literal, get_args
 
-from gi_core.constants import CUBE_FACES
+from gi_core.constants import BASIS_SIZES, CUBE_FACES, MAX_SKY_PATCHES
 from gi_core.errors import InputError
+from gi_core.sector_file import MAX_BLENDED_PROBES
+from gi_core.sky_patches import MIN_PATCHES, SKY_SCHEMES
 
 Preset = Literal["draft", "talk", "standard"]
 PRESETS: tuple[str, ...] = get_args(Preset)
+# What a knob may be where it is not any length, angle or number of 0.01 to 10 000.
+KNOB_RANGES = {
+    "sky_patches": (MIN_PATCHES, MAX_SKY_PATCHES),
+    "feedback_probes": (1, MAX_BLENDED_PROBES),
+    "voxel_probes": (1, MAX_BLENDED_PROBES),
+    "voxel_candidates": (1, 256),
+    "rays_per_face_edge": (2, 256),
+    "sun_declination_step_degrees": (1, 46),
+    "sun_hour_step_degrees": (1, 90),
+}
 
 
 @dataclass(frozen=True)
@@ -37,7 +50,7 @@ class BakeSettings:
     preset: str = "talk"
     basis: str = "cube"
     sky: str = "faces"
-    sky_patches: int = 32
+    sky_patches: int = 48
     rays_per_face_edge: int = 16
     grid_spacing_m: float = 4.0
     probe_height_m: float = 1.5
@@ -66,6 +79,30 @@ class BakeSettings:
         return knobs
 
 
+def with_knobs(settings: BakeSettings, knobs: Sequence[str]) -> BakeSettings:
+    """Settings with some knobs turned: texts such as ``basis=sh2`` or ``feedback_probes=6``.
+
+    The preset's name tells of them. Raises InputError for a knob that there is none of, and for a value that it cannot have.
+    """
+    known = {field.name: field.type for field in fields(BakeSettings) if field.name != "preset"}
+    turned: dict[str, str | int | float] = {}
+    for knob in knobs:
+        name, _, value = knob.partition("=")
+        if name not in known:
+            raise InputError(f"knob {knob[:60]!r}: expected NAME=VALUE with a name of {', '.join(known)}")
+        try:
+            turned[name] = {str: str, int: int, float: float}[type(getattr(settings, name))](value)
+        except ValueError as error:
+            raise InputError(f"knob {knob[:60]!r}: expected a number") from error
+        choices = {"basis": tuple(BASIS_SIZES), "sky": SKY_SCHEMES}.get(name)
+        low, high = KNOB_RANGES.get(name, (0.01, 1e4))
+        if choices is not None and value not in choices:
+            raise InputError(f"knob {knob[:60]!r}: expected {' or '.join(choices)}")
+        if choices is None and not low <= float(value) <= high:
+            raise InputError(f"knob {knob[:60]!r}: expected {low:g} to {high:g}")
+    return replace(settings, preset=", ".join([settings.preset, *knobs]), **turned)  # type: ignore[arg-type]
+
+
 def settings_for(preset: str) -> BakeSettings:
     """Settings of a preset. Raises InputError for a name that is not one."""
     if preset == "talk":
@@ -81,5 +118,6 @@ def settings_for(preset: str) -> BakeSettings:
             sun_hour_step_degrees=15.0,
         )
     if preset == "standard":
-        return BakeSettings(preset="standard", basis="sh2", sky="patches", feedback_probes=6)
+        # One feedback probe: with probes as close together as these, more of them were no better (MATH.md, "What each idea is worth").
+        return BakeSettings(preset="standard", basis="sh2", sky="patches")
     raise InputError(f"quality {preset!r}: expected one of {', '.join(PRESETS)}")

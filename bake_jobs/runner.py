@@ -12,7 +12,7 @@ import shutil
 import signal
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -24,7 +24,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from bake_jobs.config import BakeSettings, settings_for
+from bake_jobs.config import BakeSettings, settings_for, with_knobs
 from bake_jobs.geometry_clip import SectorCutter
 from bake_jobs.scene import Scene, scene_digest
 from bake_jobs.scene_source import load_scene
@@ -84,17 +84,18 @@ def bake(
     seed: int = 0,
     restart: bool = False,
     console: Console | None = None,
+    knobs: Sequence[str] = (),
 ) -> WorldInfo:
     """Bake a source into a dataset folder and print a summary.
 
     jobs : worker processes; None takes every core. sectors : half-open ranges ((x0, x1), (z0, z1)); None takes all.
-    restart : bake everything anew instead of skipping finished sectors. seed : recorded with the dataset.
+    restart : bake everything anew instead of skipping finished sectors. seed : recorded with the dataset. knobs : ``config.with_knobs``.
 
     Raises InputError (SourceError among them) for input that cannot be baked, WorkerLostError when a worker dies, DatasetWriteError
     when the folder cannot be written. An interrupt leaves finished sectors in place, and the same call resumes.
     """
     console = console or Console(stderr=True)
-    settings = settings_for(quality)
+    settings = with_knobs(settings_for(quality), knobs) if knobs else settings_for(quality)
     if not 0 <= seed <= LARGEST_INTEGER:
         raise InputError(f"seed: expected a whole number of 0..{LARGEST_INTEGER}, found {seed}")
     if output.exists() and not output.is_dir():

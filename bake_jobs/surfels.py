@@ -157,7 +157,7 @@ def _key(cell: Int64, room: Int64, direction: UInt8, level: Int64) -> Int64:
 
 
 def feedback(surfels: Surfels, gbuffer: GBuffer, k: int) -> tuple[UInt16, Float32]:
-    """The k closest probes among those that see each surfel (slide "Multiple bounces"), and their weights by inverse distance.
+    """The k closest probes among those that see each surfel (slide "Multiple bounces"), and their weights by inverse square distance.
 
     -> (S, k) uint16 and (S, k) float32, rows sum to 1. Seeing it is what keeps a probe behind a wall from lighting a surfel. Several
     weights are whole multiples of a fifteenth of the largest: finer ones say nothing, and take twice the bytes in a file.
@@ -174,7 +174,7 @@ def feedback(surfels: Surfels, gbuffer: GBuffer, k: int) -> tuple[UInt16, Float3
         np.minimum.at(best, surfels.of_hit, code)
         found = best != far
         taken[:, slot] = np.where(found, best & 0x3FF, 0)
-        weight[:, slot] = np.where(found, 1 / np.maximum((best >> 10) / 1000.0, 0.25), 0)
+        weight[:, slot] = np.where(found, 1 / np.maximum((best >> 10) / 1000.0, 0.25) ** 2, 0)
         if slot + 1 < k:
             code = np.where(probe == taken[surfels.of_hit, slot], far, code)
     if k > 1:

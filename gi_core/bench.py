@@ -177,11 +177,11 @@ def bench_decode(device: Device, rounds: int = 30) -> Measurement:
 
 def run(device_name: str | None = None, quick: bool = False) -> list[Measurement]:
     """All measurements of this module on one device; ``quick`` ones are a look, not a result. Raises DeviceError."""
-    from gi_core import bench_relight, bench_roofline  # these import this module
+    from gi_core import bench_basis, bench_relight, bench_roofline  # these import this module
     from gi_core.bench_lamps import bench_lamps
 
     device = shared_device(device_name)
     relight = bench_relight.run(device, quick)
     volume, decode = bench_volume(device, 10 if quick else 100), bench_decode(device, 3 if quick else 30)
     rows = [*relight, volume, decode, *bench_lamps(device, quick)]
-    return rows if quick else [*rows, *bench_roofline.run(device.name)]
+    return rows if quick else [*rows, *bench_basis.run(device), *bench_roofline.run(device.name)]

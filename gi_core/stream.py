@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gi_core.arrays import Float64, Int64
+from gi_core.constants import BASIS_SIZES
 from gi_core.dataset import SectorFacts, WorldInfo
 from gi_core.grid import SectorIndex
 from gi_core.live_sector import LiveSector
@@ -26,16 +27,27 @@ _BYTES_PER = {"probes": 256, "factors": 40, "bricks": 64, "surfels": 112, "voxel
 _BYTES_PER_SECTOR = 1 << 15
 
 
-def device_bytes(facts: SectorFacts, sun_planes: int, voxel_probes: int) -> int:
+# What a probe and a brick have for each coefficient beyond the cube's six or, of a brick, for any of harmonics; and a probe's served cube.
+_BYTES_PER_COEFFICIENT, _BRICK_BASIS_BYTES, _SERVED_BYTES = 48, 4, 96
+# A bounce that each feedback probe but the first may add to a surfel's brick.
+_BYTES_PER_BOUNCE = 16
+
+
+def device_bytes(facts: SectorFacts, sun_planes: int, voxel_probes: int, coefficients: int = 6, feedback_probes: int = 1) -> int:
     """What a sector takes on the device at most, from what the index says of it: with sun, snow, lamps and samples."""
     counted = sum(size * int(getattr(facts, name)) for name, size in _BYTES_PER.items())
+    counted += _BYTES_PER_BOUNCE * facts.surfels * (feedback_probes - 1)
+    if coefficients != BASIS_SIZES["cube"]:
+        more = max(coefficients - BASIS_SIZES["cube"], 0)
+        counted += facts.probes * (_BYTES_PER_COEFFICIENT * more + _SERVED_BYTES) + facts.bricks * _BRICK_BASIS_BYTES * coefficients
     return _BYTES_PER_SECTOR + counted + facts.surfels * sun_planes // 8 + 6 * facts.voxels * voxel_probes
 
 
 def sector_table(world: WorldInfo) -> SectorTable:
     """The world's sectors for streaming plans."""
     planes, blended = world.sun_table.plane_count, int(world.settings.get("voxel_probes", 4))
-    return SectorTable.of({index: device_bytes(facts, planes, blended) for index, facts in world.sectors.items()})
+    size, feedback = BASIS_SIZES[world.basis], int(world.settings.get("feedback_probes", 1))
+    return SectorTable.of({index: device_bytes(facts, planes, blended, size, feedback) for index, facts in world.sectors.items()})
 
 
 @dataclass(frozen=True)

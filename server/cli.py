@@ -106,6 +106,7 @@ def bake(
     jobs: Annotated[int, typer.Option(min=0, max=1024, help="Processes; 0 means one per core.")] = 0,
     sectors: Annotated[str | None, typer.Option(help="X0:X1,Z0:Z1, half open; sector (i, j) covers [64 i, 64 i + 64) m.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Same source, settings and seed give the same bytes.")] = 0,
+    knob: Annotated[list[str] | None, typer.Option(help="A setting of the preset, NAME=VALUE as in basis=cube; repeatable.")] = None,
     restart: Annotated[bool, typer.Option("--restart/--resume", help="Bake finished sectors again, or keep them.")] = False,
 ) -> None:
     """Bake a city into a dataset. Interrupted with Ctrl-C, it keeps the sectors that are finished, and the same command bakes the rest."""
@@ -118,7 +119,7 @@ def bake(
         from bake_jobs.runner import bake as run
 
         with writing(output):
-            run(source, output, quality, jobs, chosen, seed, restart)
+            run(source, output, quality, jobs, chosen, seed, restart, knobs=knob or ())
     except KeyboardInterrupt:
         kept = sum(1 for _ in output.glob("sectors/*.gisec"))
         again = " (without --restart)" if restart else ""

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from bake_jobs import compare
-from bake_jobs.compare import STAGES, choose_sectors, compare_dataset
+from bake_jobs.compare import CUBE_STAGES, STAGES, choose_sectors, compare_dataset
+from gi_core.basis import from_axes
 from gi_core.constants import VOLUME_SHAPE, VOXEL_NO_SECTOR, VOXEL_OUTDOORS, VOXEL_SOLID
 from gi_core.errors import InputError
 from gi_core.geometry_file import Geometry
@@ -33,9 +34,10 @@ class PlainDataset:
     path = "plain"
     lamps = ()
     wall_height_m = 0.0  # of a black wall along z through the middle of every sector
+    basis = "cube"
 
     def __init__(self, sectors=PLAIN):
-        self.world = SimpleNamespace(preset="talk", basis="cube", location=Location(), sectors=sectors, lamps=self.lamps, bake_id="ab")
+        self.world = SimpleNamespace(preset="talk", basis=self.basis, location=Location(), sectors=sectors, lamps=self.lamps, bake_id="ab")
 
     def geometry(self, index):
         corners = index.origin + 64 * np.array([[0, 0, 0], [0, 0, 1], [1, 0, 1], [1, 0, 0]]) + [0, GROUND_M, 0]
@@ -49,9 +51,9 @@ class PlainDataset:
         return SimpleNamespace(index=index, probe_position=position, probe_room=np.zeros(4, np.uint16), probe_flags=np.zeros(4, np.uint8))
 
 
-def plain_engine(factor=1.0, high_factor=1.0, no_sector_from=32, solid_from=32):
-    """Serves the plain's light times a factor, that of voxels 5 m up or more times another one too. Voxel columns from an x index on
-    are without a sector, or called solid."""
+def plain_engine(factor=1.0, high_factor=1.0, no_sector_from=32, solid_from=32, basis="cube"):
+    """Serves the plain's light in a basis, times a factor, that of voxels 5 m up or more times another one too. Voxel columns from an x
+    index on are without a sector, or called solid."""
 
     class Engine:
         def __init__(self, dataset, device):
@@ -64,18 +66,19 @@ def plain_engine(factor=1.0, high_factor=1.0, no_sector_from=32, solid_from=32):
             return Lighting("2024-06-21T12:00:00", weather, dark, dark, sky, np.zeros((6, 3)), 0.0, 0.0, 0.0)
 
         def lit_sector(self, index, lighting):
-            return factor * np.repeat(plain_cube()[None], 4, axis=0)
+            return factor * np.repeat((from_axes(basis) @ plain_cube())[None], 4, axis=0)
 
-        def volume(self, position, lighting):
+        def volume(self, position, lighting, basis=basis):
             first = volume_first_voxel(position)
-            values = factor * np.broadcast_to(plain_cube()[:, None, None, None], (6, *VOLUME_SHAPE, 3)).astype(np.float32)
+            light = from_axes(basis) @ plain_cube()
+            values = factor * np.broadcast_to(light[:, None, None, None], (len(light), *VOLUME_SHAPE, 3)).astype(np.float32)
             mask = np.full(VOLUME_SHAPE, VOXEL_OUTDOORS, np.uint8)
             heights = voxel_centre(first + np.arange(VOLUME_SHAPE[0])[:, None])[:, 1]
             values[:, heights > GROUND_M + 5] *= high_factor
             mask[heights < GROUND_M] = VOXEL_SOLID
             mask[:, :, solid_from:] = VOXEL_SOLID
             mask[:, :, no_sector_from:] = VOXEL_NO_SECTOR
-            return Volume(values, mask, first, ())
+            return Volume(values, mask, first, (), basis)
 
     return Engine
 
@@ -106,6 +109,21 @@ def test_right_light_has_no_error_at_any_stage(run):
     assert report["preset"] == "talk"
     assert report["basis"] == "cube"
     assert report["open_air_called_solid"] == 0
+
+
+def test_harmonics_are_judged_as_harmonics_and_as_the_cube_that_is_made_of_them(run, monkeypatch):
+    # Half a sphere of light has no band above the first: harmonics and the six faces hold it alike.
+    monkeypatch.setattr(PlainDataset, "basis", "sh2")
+    report = run(plain_engine(basis="sh2"))
+    assert report["basis"] == "sh2"
+    stages = report["states"]["noon"]
+    assert tuple(stages) == STAGES + CUBE_STAGES
+    for stage, numbers in stages.items():
+        assert numbers["median"] < CLOSE, stage
+        assert numbers["noise"] < 0.01, stage
+    wrong = run(plain_engine(1.25, basis="sh2"), samples=256)["states"]["noon"]
+    for stage, numbers in wrong.items():
+        assert numbers["bias"] == pytest.approx(0 if stage.startswith("floor") else 0.25, abs=2 * CLOSE), stage
 
 
 def test_wrong_light_shows_everywhere_but_in_the_floor(run):

@@ -21,6 +21,7 @@ from gi_core.live_volumes import HELD_TICKS
 from gi_core.live_world import LiveWorld, TickPlayers, TickReport
 from gi_core.relight_input import relight_input
 from gi_core.settings import NEUTRAL, Settings
+from gi_core.stream import device_bytes
 from gi_core.stream_plan import StreamOptions
 from gi_core.world import Lamp
 
@@ -121,6 +122,28 @@ def test_volumes_in_each_basis_are_the_very_bytes_of_a_query(basis, settings):
         query = engine.volume(STREET, lighting, settings, basis=basis).values
         # Gains are applied in a kernel here, in NumPy there: float32 rounds either way.
         np.testing.assert_allclose(found, query, atol=0 if settings is NEUTRAL else 1e-6 * query.max())
+    finally:
+        world.close()
+
+
+@pytest.mark.parametrize("golden", [GOLDEN, HARMONICS], ids=["cube", "sh2"])
+def test_a_sector_takes_no_more_than_the_budget_counts_for_it(golden):
+    dataset = Dataset.open(golden)
+    world = LiveWorld(dataset, shadow_map=True)
+    try:
+        lighting = Engine(dataset).lighting("12:00", "clear")
+        light = light_of(world, lighting, dataset.world.lamps, Settings(bounce_factor=2.0))
+        Run(world).settle(at(STREET), light)
+        planes, settings = dataset.world.sun_table.plane_count, dataset.world.settings
+        for index, sector in world.streamer.residents.items():
+            counted = device_bytes(
+                dataset.world.sectors[index],
+                planes,
+                settings["voxel_probes"],
+                {"cube": 6, "sh2": 9}[dataset.world.basis],
+                settings["feedback_probes"],
+            )
+            assert sector.nbytes <= counted
     finally:
         world.close()
 

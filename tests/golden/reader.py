@@ -145,6 +145,30 @@ def read_distant(data: bytes) -> tuple[dict[str, Any], Arrays]:
     return read_container(data, "DIST")
 
 
+def patches_in_rows(patches: int) -> list[int]:
+    """The dome's rows, from the zenith down (section 6)."""
+    cap = math.acos(1 - 1 / patches)
+    rings = max(1, round((math.pi / 2 - cap) / math.sqrt(2 * math.pi / patches)))
+    edge = [math.cos(cap + (math.pi / 2 - cap) * i / rings) for i in range(rings + 1)]
+    rows, owed = [1], 0.0
+    for i in range(rings):
+        wanted = patches * (edge[i] - edge[i + 1]) + owed
+        rows.append(max(1, round(wanted)))
+        owed = wanted - rows[-1]
+    rows[-1] += patches - sum(rows)
+    return rows
+
+
+def patch_at(patches: int, x: float, y: float, z: float) -> int:
+    """The patch that a direction above the horizon looks at (section 6)."""
+    before = 0
+    for count in patches_in_rows(patches):
+        if 1 - (before + count) / patches < y <= 1 - before / patches:
+            return before + int(math.atan2(z, x) % (2 * math.pi) / (2 * math.pi / count))
+        before += count
+    raise AssertionError("below the horizon")
+
+
 def sun_plane_count(latitude: float, north: float, declination_step: float, hour_angle_step: float) -> int:
     """D, by walking over the nodes (section 6)."""
     rows, columns = math.ceil(46.88 / declination_step) + 1, math.ceil(360 / hour_angle_step)

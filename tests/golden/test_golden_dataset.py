@@ -15,14 +15,14 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from gi_core import dataset, distant_file, geometry_file, sector_file
+from gi_core import dataset, distant_file, geometry_file, sector_file, sky_patches
 from gi_core.dataset import Dataset
 from gi_core.engine import Engine
 from gi_core.sector import Sector
 
 HERE = Path(__file__).parent
 # Of world.json's version: what the dataset of each holds, decoded.
-DIGESTS = {1: "f6b367f763c6b74747559c79e7d8c404", 2: "25302d021fc2a719939347ab066a472d"}
+DIGESTS = {1: "f6b367f763c6b74747559c79e7d8c404", 2: "0c6a49fe61eea3ef283ba7a6b4450b3c"}
 GOLDEN = HERE / "v1"
 SECTORS = sorted(path for version in DIGESTS for path in (HERE / f"v{version}" / "sectors").iterdir())
 GEOMETRIES = sorted(path for version in DIGESTS for path in (HERE / f"v{version}" / "geometry").iterdir())
@@ -131,6 +131,16 @@ def test_world_json_agrees_with_the_files_it_names(golden):
         table["latitude_degrees"], table["north_degrees"], table["declination_step_degrees"], table["hour_angle_step_degrees"]
     )
     assert planes == table["planes"]
+
+
+@pytest.mark.parametrize("patches", [4, 8, 24, 48, 145, 1024])
+def test_patches_of_the_sky_are_where_format_md_says(patches):
+    assert tuple(reader.patches_in_rows(patches)) == sky_patches.patches_in_rows(patches)
+    direction = np.random.default_rng(patches).normal(size=(500, 3))
+    direction[:, 1] = np.abs(direction[:, 1])
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    found = sky_patches.patch_of(direction, patches)
+    assert found.tolist() == [reader.patch_at(patches, *one) for one in direction.tolist()]
 
 
 @pytest.mark.parametrize("version", DIGESTS)

@@ -111,7 +111,7 @@ def test_info_shows_the_dataset_and_a_sector(sectorlight: RunCommand, city: Path
 
 
 def test_presets_that_come_later_are_refused_before_anything_is_read(sectorlight: RunCommand, tmp_path: Path) -> None:
-    for quality in ("standard", "reference", "best"):
+    for quality in ("reference", "best"):
         done = sectorlight("bake", SOURCE, "-o", str(tmp_path / "out"), "--quality", quality)
         expect_refusal(done, quality, *PRESETS)
     assert not (tmp_path / "out").exists()
@@ -138,7 +138,7 @@ def test_what_the_system_refuses_is_one_line_with_the_path(sectorlight: RunComma
 
 
 def test_a_full_disk_names_the_output(sectorlight: RunCommand, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fill(*_: object) -> None:
+    def fill(*_: object, **__: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr("bake_jobs.runner.bake", fill)

@@ -1,0 +1,47 @@
+"""Presets and their knobs: each idea is one switch, and what a knob cannot be is refused by name."""
+
+import pytest
+
+from bake_jobs.config import PRESETS, settings_for, with_knobs
+from gi_core.errors import InputError
+
+
+def test_a_knob_changes_one_setting_and_the_name():
+    talk = settings_for("talk")
+    turned = with_knobs(talk, ["basis=sh2", "feedback_probes=6", "cells_double_beyond_m=16"])
+    assert (turned.basis, turned.feedback_probes, turned.cells_double_beyond_m) == ("sh2", 6, 16.0)
+    assert turned.preset == "talk, basis=sh2, feedback_probes=6, cells_double_beyond_m=16"
+    changed = {"preset", "basis", "feedback_probes", "cells_double_beyond_m"}
+    assert {k: v for k, v in turned.to_json().items() if k not in changed} == {k: v for k, v in talk.to_json().items() if k not in changed}
+
+
+def test_standard_is_the_talk_and_its_ideas():
+    ideas = with_knobs(settings_for("talk"), ["basis=sh2", "sky=patches"]).to_json()
+    assert settings_for("standard").to_json() | {"preset": ""} == ideas | {"preset": ""}
+
+
+@pytest.mark.parametrize(
+    ("knob", "said"),
+    [
+        ("basis", "expected cube or sh1 or sh2"),
+        ("basis=sh9", "expected cube or sh1 or sh2"),
+        ("sky=none", "expected faces or patches"),
+        ("sky_patches=2", "expected 4 to 1024"),
+        ("feedback_probes=33", "expected 1 to 32"),
+        ("feedback_probes=six", "expected a number"),
+        ("grid_spacing_m=nan", "expected 0.01 to 10000"),
+        ("grid_spacing_m=0", "expected 0.01 to 10000"),
+        ("preset=best", "expected NAME=VALUE"),
+        ("speed=11", "expected NAME=VALUE"),
+    ],
+)
+def test_a_knob_that_cannot_be_is_refused(knob, said):
+    with pytest.raises(InputError, match=said):
+        with_knobs(settings_for("talk"), [knob])
+
+
+def test_a_knob_that_does_nothing_is_not_part_of_a_bake():
+    assert "sky_patches" not in settings_for("talk").to_json()
+    assert settings_for("standard").to_json()["sky_patches"] == settings_for("standard").sky_sources
+    assert settings_for("talk").sky_sources == 6
+    assert {settings_for(name).preset for name in PRESETS} == set(PRESETS)
