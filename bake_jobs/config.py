@@ -27,6 +27,16 @@ class BakeSettings:
     voxel_probes : probes that a voxel blends at most
     voxel_candidates : nearest probes that are tested for visibility from a voxel
     feedback_probes : probes that light a surfel
+    placement : "grid", ground grid and walls; "adaptive", where light changes (bake_jobs/adaptive.py)
+    voxel_weights : "nearest", visible probes by distance; "fitted", to trial light (bake_jobs/fit.py)
+    trial_rays_per_face_edge : of the trial light at every voxel; more: less noise in what placement and weights follow
+    probe_worth : adaptive placement goes on until a probe takes less than this off the squared relative errors of the voxels that see it,
+        summed; less: more probes
+    probe_budget : adaptive probes of a sector at most, margin included
+    band_m [m] : adaptive probes stand up to this high above the street; above, a few carry the light
+    fit_candidates : visible probes that a voxel's weights are fitted over
+    fit_ridge : pull of fitted weights towards inverse distance; more: smoother, less exact
+    target_error : probes are added until the bake's own estimate of the error near surfaces is below; 0: probe_worth alone decides
     """
 
     preset: str = "talk"
@@ -46,6 +56,15 @@ class BakeSettings:
     voxel_probes: int = 4
     voxel_candidates: int = 8
     feedback_probes: int = 1
+    placement: Literal["grid", "adaptive"] = "grid"
+    voxel_weights: Literal["nearest", "fitted"] = "nearest"
+    trial_rays_per_face_edge: int = 8
+    probe_worth: float = 0.02
+    probe_budget: int = 1000
+    band_m: float = 28.0
+    fit_candidates: int = 12
+    fit_ridge: float = 0.002
+    target_error: float = 0.0
 
     def to_json(self) -> dict[str, Any]:
         """The knobs as a JSON object."""

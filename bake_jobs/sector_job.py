@@ -5,12 +5,15 @@ from typing import Any
 
 import numpy as np
 
-from bake_jobs import factors, gbuffer, placement, sun_visibility, surfels, voxels
+from bake_jobs import adaptive, factors, gbuffer, placement, sun_visibility, surfels, voxels
+from bake_jobs.air import find_air
 from bake_jobs.config import BakeSettings
 from bake_jobs.geometry_clip import SectorCutter
 from bake_jobs.inside import Solids
 from bake_jobs.rays import RayScene
 from bake_jobs.scene import Scene
+from bake_jobs.trial_light import TrialScene
+from bake_jobs.trial_states import trial_states
 from gi_core import geometry_file, sector_file
 from gi_core.arrays import Float32, Float64
 from gi_core.constants import ALBEDO_MAX, ROOM_OUTDOORS
@@ -44,6 +47,7 @@ class SectorBaker:
         self._solids = Solids(scene.vertices, scene.triangles)
         self._cutter = SectorCutter(scene)
         self._pattern = gbuffer.cube_map_pattern(settings.rays_per_face_edge)
+        self._trial = self._trial_scene() if settings.placement == "adaptive" or settings.voxel_weights == "fitted" else None
 
     def bake(self, index: SectorIndex) -> BakedSector:
         """Both files of one sector."""
@@ -54,14 +58,15 @@ class SectorBaker:
     def bake_arrays(self, index: SectorIndex, geometry: Geometry) -> tuple[Sector, dict[str, Any]]:
         """One sector's arrays before quantisation, and its meta. ``geometry`` is what SectorCutter.cut gives for it."""
         scene, settings, rays = self._scene, self._settings, self._rays
-        placed = placement.place_probes(rays, self._solids, scene.bounds, index, settings, scene.rooms, scene.hints)
+        placed, trial = self._place(index)
         seen = gbuffer.render(rays, placed.position, self._pattern)
         room = surfels.rooms_of_hits(seen, placed.room, scene.rooms)
         clustered = surfels.cluster(seen, room, index.origin, scene.albedo, scene.emission, settings.cells_double_beyond_m)
         weights = factors.gather(seen, self._pattern, clustered)
         feedback_probe, feedback_weight = surfels.feedback(clustered, seen, settings.feedback_probes)
         heights = geometry.vertices[:, 1] if len(geometry.vertices) else np.zeros(1)
-        lattice = voxels.bake_voxels(rays, self._solids, np.array([heights.min(), heights.max()]), index, placed, settings, scene.rooms)
+        surfaces = np.array([heights.min(), heights.max()])
+        lattice = voxels.bake_voxels(rays, self._solids, surfaces, index, placed, settings, scene.rooms, trial)
         emits = bool(clustered.emission.any())
         sector = Sector(
             index=index,
@@ -102,7 +107,29 @@ class SectorBaker:
             "voxels_blind": lattice.blind,
             "distant_sky": _distant_sky(weights.sky, placed),
         }
+        if lattice.expected_error is not None:
+            meta["expected_error"] = lattice.expected_error
         return sector, meta
+
+    def _trial_scene(self) -> TrialScene:
+        scene = self._scene
+        states = trial_states(self._sun_directions, bool(scene.lamps) or bool(scene.emission.any()))
+        return TrialScene(self._rays, scene.albedo, scene.emission, scene.lamps, states, self._settings.trial_rays_per_face_edge)
+
+    def _place(self, index: SectorIndex) -> tuple[placement.Placement, adaptive.Trial | None]:
+        """Probes, and where the voxels' weights are to be fitted, the trial light."""
+        scene, settings, rays, solids, trial = self._scene, self._settings, self._rays, self._solids, self._trial
+        if trial is None:
+            return placement.place_probes(rays, solids, scene.bounds, index, settings, scene.rooms, scene.hints), None
+        air = find_air(rays, solids, scene.bounds, index, settings, scene.rooms)
+        light = trial.light(air.centre)
+        if settings.placement == "adaptive":
+            placed, cube = adaptive.place_adaptive(rays, solids, index, settings, scene.rooms, scene.hints, air, light, trial)
+        else:
+            placed = placement.place_probes(rays, solids, scene.bounds, index, settings, scene.rooms, scene.hints)
+            cube = trial.light(placed.position).cube
+        fitted = adaptive.Trial(trial.states, air, light, cube) if settings.voxel_weights == "fitted" else None
+        return placed, fitted
 
 
 def _distant_sky(sky: Float32, placed: placement.Placement) -> list[float]:
