@@ -73,7 +73,7 @@ def find_air(
     return Air(found[kept], centre[kept], height[kept], room[kept], in_band[kept], own[kept])
 
 
-def border_blocks(air: Air, index: SectorIndex, margin_m: float) -> list[Int64]:
+def border_blocks(air: Air, index: SectorIndex, margin_m: float) -> list[tuple[Int64, int]]:
     """Voxels (numbers) within ``margin_m`` of the sector's border lines, block by block: four corners that four sectors share, and four
     edges that two do. Every sector that shares a block finds the same voxels in it, in the same order."""
     place = air.centre[:, [0, 2]] / SECTOR_SIZE_M
@@ -85,7 +85,7 @@ def border_blocks(air: Air, index: SectorIndex, margin_m: float) -> list[Int64]:
     first = 2 * np.array(index)
     touching = near.any(axis=1) & air.in_band & ((block >= first) & (block <= first + 2)).all(axis=1)
     for key in np.unique(block[touching], axis=0):
-        found.append(np.flatnonzero(touching & (block == key).all(axis=1)))
+        found.append((np.flatnonzero(touching & (block == key).all(axis=1)), 4 if (key % 2 == 0).all() else 2))
     return found
 
 
@@ -96,7 +96,7 @@ def _street(ray_scene: RayScene, bounds: Float64, x: Int64, z: Int64) -> Float64
     hits = ray_scene.closest(at, np.tile(np.array([[0, 1, 0]], np.float32), (len(at), 1)))
     street = np.where(hits.hit, at[:, 1] + hits.distance, np.nan)
     # To the centimetre: rays are rounded.
-    return np.round(street, 2).reshape(x.shape)
+    return np.asarray(np.round(street, 2).reshape(x.shape), np.float64)
 
 
 def _room_lattice(room: Room, x: Int64, z: Int64) -> Int64:

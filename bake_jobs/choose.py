@@ -49,11 +49,6 @@ class Pairs:
         starts, probe_starts = (np.concatenate([[0], np.cumsum(np.bincount(ids, minlength=count))]) for ids in (voxel, probe))
         return cls(starts, probe, voxel, by_probe, probe_starts)
 
-    def within(self, kept: Bool) -> "Pairs":
-        """Only pairs both of whose voxels are ``kept`` (n,), under their old numbers."""
-        both = kept[self.voxel] & kept[self.probe]
-        return Pairs.of(self.voxel[both], self.probe[both], len(kept))
-
 
 def neighbour_pairs(lattice: Int64) -> tuple[Int64, Int64]:
     """Pairs (v, j) of voxels with world lattice indices (n, 3) that are close enough to explain one another. Each voxel explains itself."""

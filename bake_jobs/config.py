@@ -1,6 +1,6 @@
 """What a bake may trade. A preset is a set of values of these knobs; the file format knows none of them."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal, get_args
 
 from gi_core.errors import InputError
@@ -59,7 +59,7 @@ class BakeSettings:
     placement: Literal["grid", "adaptive"] = "grid"
     voxel_weights: Literal["nearest", "fitted"] = "nearest"
     trial_rays_per_face_edge: int = 8
-    probe_worth: float = 0.02
+    probe_worth: float = 0.01
     probe_budget: int = 1000
     band_m: float = 28.0
     fit_candidates: int = 12
@@ -69,6 +69,17 @@ class BakeSettings:
     def to_json(self) -> dict[str, Any]:
         """The knobs as a JSON object."""
         return asdict(self)
+
+
+# What placement="adaptive" and voxel_weights="fitted" want of the other knobs: both tuned together (gi_core/MATH.md).
+ADAPTIVE: dict[str, Any] = {"placement": "adaptive", "voxel_weights": "fitted", "voxel_candidates": 24, "margin_m": 3.2}
+
+
+def with_target_error(settings: BakeSettings, target_error: float) -> BakeSettings:
+    """Settings that place probes adaptively until an error is met. Raises InputError for one that no bake can be asked for."""
+    if not 0.001 <= target_error <= 1.0:
+        raise InputError(f"--target-error {target_error:g}: expected a relative error of 0.001..1, as in 0.04")
+    return replace(settings, **ADAPTIVE, target_error=target_error)
 
 
 def settings_for(preset: str) -> BakeSettings:

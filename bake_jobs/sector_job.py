@@ -12,6 +12,7 @@ from bake_jobs.geometry_clip import SectorCutter
 from bake_jobs.inside import Solids
 from bake_jobs.rays import RayScene
 from bake_jobs.scene import Scene
+from bake_jobs.target_error import probes_for_target
 from bake_jobs.trial_light import TrialScene
 from bake_jobs.trial_states import trial_states
 from gi_core import geometry_file, sector_file
@@ -107,8 +108,8 @@ class SectorBaker:
             "voxels_blind": lattice.blind,
             "distant_sky": _distant_sky(weights.sky, placed),
         }
-        if lattice.expected_error is not None:
-            meta["expected_error"] = lattice.expected_error
+        if lattice.estimated_error is not None:
+            meta["estimated_error"] = round(lattice.estimated_error, 5)
         return sector, meta
 
     def _trial_scene(self) -> TrialScene:
@@ -124,7 +125,11 @@ class SectorBaker:
         air = find_air(rays, solids, scene.bounds, index, settings, scene.rooms)
         light = trial.light(air.centre)
         if settings.placement == "adaptive":
-            placed, cube = adaptive.place_adaptive(rays, solids, index, settings, scene.rooms, scene.hints, air, light, trial)
+            ranking = adaptive.rank_probes(rays, solids, index, settings, scene.rooms, scene.hints, air, light, trial)
+            count = min(ranking.enough, settings.probe_budget)
+            if settings.target_error:
+                count = probes_for_target(rays, ranking, trial.states, air, light, settings)
+            placed, cube = ranking.first(count)
         else:
             placed = placement.place_probes(rays, solids, scene.bounds, index, settings, scene.rooms, scene.hints)
             cube = trial.light(placed.position).cube

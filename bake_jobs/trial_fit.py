@@ -33,7 +33,7 @@ class TrialFit:
         self._faint = JUDGED_FAINT * judged.mean(axis=(0, 2), dtype=np.float64)[:, None] if len(judged) else np.zeros((1, 1))
 
     @property
-    def expected_error(self) -> float | None:
+    def estimated_error(self) -> float | None:
         """Median relative error of the held-out states at the sector's own voxels near surfaces; None where there is none."""
         return float(np.median(np.concatenate(self._errors))) if self._errors else None
 

@@ -19,9 +19,9 @@ from bake_jobs.surfels import KEY_OFFSET_M, principal_direction
 from bake_jobs.trial_states import TrialStates
 from gi_core.ambient_cube import FACE_DIRECTIONS
 from gi_core.arrays import Bool, Float32, Float64, Int32, Int64
+from gi_core.layout import SURFEL_PLACE
 from gi_core.lights import light_records
 from gi_core.lights_twin import unshadowed
-from gi_core.layout import SURFEL_PLACE
 from gi_core.spectrum import LUMINANCE_FROM_RGB
 from gi_core.world import Lamp
 

@@ -33,7 +33,7 @@ AIR_ABOVE_GROUND_M = 28.0
 
 @dataclass(frozen=True, eq=False)
 class Voxels:
-    """Arrays as gi_core.sector describes them; ``blind``: how many free voxels see none of their closest probes; ``expected_error``: of
+    """Arrays as gi_core.sector describes them; ``blind``: how many free voxels see none of their closest probes; ``estimated_error``: of
     fitted weights (TrialFit)."""
 
     first: Int32
@@ -42,7 +42,7 @@ class Voxels:
     probe: UInt16
     weight: Float32
     blind: int
-    expected_error: float | None = None
+    estimated_error: float | None = None
 
 
 def bake_voxels(
@@ -64,7 +64,7 @@ def bake_voxels(
     # An authored room is air, whatever way its walls were modelled.
     kind[(room == ROOM_OUTDOORS) & solid_voxels(ray_scene, solids, centre.reshape(*shape, 3)).reshape(-1)] = VOXEL_SOLID
     fit = None if trial is None else TrialFit(trial, lattice.reshape(-1, 3), settings)
-    probe, weight, blind = _blend(ray_scene, centre, kind, room, placement, settings, fit)
+    probe, weight, blind = blend(ray_scene, centre, kind, room, placement, settings, fit)
     source = _nearest((kind != VOXEL_SOLID) & ~(blind & (room == ROOM_OUTDOORS)), shape)
     probe, weight = probe[source], weight[source]
 
@@ -78,7 +78,7 @@ def bake_voxels(
         probe=np.ascontiguousarray(probe.reshape(*shape, k)[inner]),
         weight=np.ascontiguousarray(weight.reshape(*shape, k)[inner]),
         blind=int(blind.sum()),
-        expected_error=None if fit is None else fit.expected_error,
+        estimated_error=None if fit is None else fit.estimated_error,
     )
 
 
@@ -93,7 +93,7 @@ def _lattice(index: SectorIndex, surfaces: Float64) -> tuple[Int64, tuple[int, i
     return np.stack([x, y, z], axis=-1), (len(ranges[0]), len(ranges[1]), len(ranges[2]))
 
 
-def _blend(
+def blend(
     ray_scene: RayScene,
     centre: Float64,
     kind: UInt8,
