@@ -169,7 +169,7 @@ def _choose_within(features: Float32, importance: Float64, pairs: Pairs, may: Bo
 
 
 def _features(cube: Float32, floor: Float32) -> Float32:
-    """(n, states * 6): logarithms of light over a floor (states,), scaled so that the squared distance of two is the mean squared relative difference."""
+    """(n, states * 6): logarithms of light over a floor (states,); squared distances are mean squared relative differences."""
     logarithm = np.log(np.maximum(cube, 0) + floor[:, None])
     rounded = np.round(logarithm / LIGHT_STEP) * LIGHT_STEP
     return np.asarray(rounded.reshape(len(cube), -1) / np.sqrt(cube.shape[1] * 6), np.float32)

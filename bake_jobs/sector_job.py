@@ -44,7 +44,7 @@ class SectorBaker:
         self._settings = settings
         self._sun_directions = sun_directions
         self._bake_id = bake_id
-        self._rays = RayScene(scene.vertices, scene.triangles)
+        self.rays = RayScene(scene.vertices, scene.triangles)
         self._solids = Solids(scene.vertices, scene.triangles)
         self._cutter = SectorCutter(scene)
         self._pattern = gbuffer.cube_map_pattern(settings.rays_per_face_edge)
@@ -58,8 +58,8 @@ class SectorBaker:
 
     def bake_arrays(self, index: SectorIndex, geometry: Geometry) -> tuple[Sector, dict[str, Any]]:
         """One sector's arrays before quantisation, and its meta. ``geometry`` is what SectorCutter.cut gives for it."""
-        scene, settings, rays = self._scene, self._settings, self._rays
-        placed, trial = self._place(index)
+        scene, settings, rays = self._scene, self._settings, self.rays
+        placed, trial = self.place(index)
         seen = gbuffer.render(rays, placed.position, self._pattern)
         room = surfels.rooms_of_hits(seen, placed.room, scene.rooms)
         clustered = surfels.cluster(seen, room, index.origin, scene.albedo, scene.emission, settings.cells_double_beyond_m)
@@ -115,11 +115,11 @@ class SectorBaker:
     def _trial_scene(self) -> TrialScene:
         scene = self._scene
         states = trial_states(self._sun_directions, bool(scene.lamps) or bool(scene.emission.any()))
-        return TrialScene(self._rays, scene.albedo, scene.emission, scene.lamps, states, self._settings.trial_rays_per_face_edge)
+        return TrialScene(self.rays, scene.albedo, scene.emission, scene.lamps, states, self._settings.trial_rays_per_face_edge)
 
-    def _place(self, index: SectorIndex) -> tuple[placement.Placement, adaptive.Trial | None]:
+    def place(self, index: SectorIndex) -> tuple[placement.Placement, adaptive.Trial | None]:
         """Probes, and where the voxels' weights are to be fitted, the trial light."""
-        scene, settings, rays, solids, trial = self._scene, self._settings, self._rays, self._solids, self._trial
+        scene, settings, rays, solids, trial = self._scene, self._settings, self.rays, self._solids, self._trial
         if trial is None:
             return placement.place_probes(rays, solids, scene.bounds, index, settings, scene.rooms, scene.hints), None
         air = find_air(rays, solids, scene.bounds, index, settings, scene.rooms)
