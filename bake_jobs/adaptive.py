@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bake_jobs.air import Air, border_blocks
+from bake_jobs.air import Air, beside_border, border_blocks
 from bake_jobs.choose import GAIN_STEP, Chooser, Pairs, neighbour_pairs
 from bake_jobs.config import BakeSettings
 from bake_jobs.inside import Solids
@@ -42,7 +42,7 @@ DARK = 0.002
 DARK_LAMPLIGHT_LX = 0.5
 # Differences of light smaller than this are none: what rounding leaves must not decide between two places.
 LIGHT_STEP = 1e-3
-CHOSEN_DIMENSIONS = 12
+CHOSEN_DIMENSIONS = 8
 # A border probe is stored by every sector that shares it. Its price grows as the root of their number: in proportion, seams began to show.
 SHARED_PRICE = 0.5
 # In the mean of two cities the bake's estimate is about this where a probe is worth that; it falls as the root.
@@ -131,7 +131,7 @@ def _choose(
     the border's among them, are worth it."""
     floor = np.where(states.lamps[states.fitted], DARK_LAMPLIGHT_LX, DARK).astype(np.float32)
     features = _features(light.cube[:, states.fitted], floor)
-    voxel, probe = neighbour_pairs(air.lattice)
+    voxel, probe = neighbour_pairs(air.lattice, beside_border(air, settings.margin_m))
     seen = _mutually_visible(ray_scene, air, voxel, probe)
     pairs = Pairs.of(voxel[seen], probe[seen], len(air.lattice))
     importance = _importance(air, light, hints, settings.band_m)

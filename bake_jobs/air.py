@@ -73,12 +73,20 @@ def find_air(
     return Air(found[kept], centre[kept], height[kept], room[kept], in_band[kept], own[kept])
 
 
+def beside_border(air: Air, margin_m: float) -> Bool:
+    """(n, 3): whether a voxel lies within ``margin_m`` of a border line along each axis; never along y."""
+    place = air.centre / SECTOR_SIZE_M
+    near = np.abs(place - np.round(place)) * SECTOR_SIZE_M < margin_m
+    near[:, 1] = False
+    return np.asarray(near & air.in_band[:, None], np.bool_)
+
+
 def border_blocks(air: Air, index: SectorIndex, margin_m: float) -> list[tuple[Int64, int]]:
     """Voxels (numbers) within ``margin_m`` of the sector's border lines, block by block: four corners that four sectors share, and four
     edges that two do. Every sector that shares a block finds the same voxels in it, in the same order."""
     place = air.centre[:, [0, 2]] / SECTOR_SIZE_M
     line = np.round(place)
-    near = np.abs(place - line) * SECTOR_SIZE_M < margin_m
+    near = beside_border(air, margin_m)[:, [0, 2]]
     # 2 k on border line k, 2 k + 1 between lines k and k + 1.
     block = np.where(near, 2 * line, 2 * np.floor(place) + 1).astype(np.int64)
     found = []

@@ -50,8 +50,11 @@ class Pairs:
         return cls(starts, probe, voxel, by_probe, probe_starts)
 
 
-def neighbour_pairs(lattice: Int64) -> tuple[Int64, Int64]:
-    """Pairs (v, j) of voxels with world lattice indices (n, 3) that are close enough to explain one another. Each voxel explains itself."""
+def neighbour_pairs(lattice: Int64, any_step: Bool) -> tuple[Int64, Int64]:
+    """Pairs (v, j) of voxels with world lattice indices (n, 3) that are close enough to explain one another. Each voxel explains itself.
+
+    any_step : (n, 3), axes along which a voxel may explain far ones wherever it lies: across a strip that is too narrow for a thin lattice
+    """
     low = lattice.min(axis=0) - 8
     shape = lattice.max(axis=0) - low + 9
     number = np.full(tuple(shape), -1, np.int64)
@@ -66,7 +69,7 @@ def neighbour_pairs(lattice: Int64) -> tuple[Int64, Int64]:
         distance = np.linalg.norm(offset, axis=1)
         offset = offset[(distance <= reach) & (distance > nearer)]
         nearer = reach
-        coarse = np.flatnonzero((lattice % step == 0).all(axis=1))
+        coarse = np.flatnonzero(((lattice % step == 0) | any_step).all(axis=1))
         # From the few that explain to the many that are explained.
         for step_flat in offset @ np.array([shape[1] * shape[2], shape[2], 1]):
             found = number.reshape(-1)[flat[coarse] + step_flat]
@@ -131,14 +134,21 @@ class Chooser:
         number = pairs.starts[voxels + 1] - pairs.starts[voxels]
         first = np.cumsum(number) - number
         at = np.arange(int(number.sum())) + np.repeat(pairs.starts[voxels] - first, number)
-        voxel, probe = pairs.voxel[at], pairs.probe[at]
-        explained = self._explained[voxel]
-        off, step = self._light[voxel] - explained, self._light[probe] - explained
-        # |off - t step|^2 at the best t, from three scalar products.
-        squared, along, length = (np.einsum("md,md->m", a, b) for a, b in ((off, off), (off, step), (step, step)))
-        share = np.where(self._covered[voxel], np.clip(along / np.maximum(length, 1e-12), 0, 1), 1)
-        left = squared - share * (2 * along - share * length)
-        gain = np.where(self._covered[voxel], squared, UNLIT) - left
-        gain = np.maximum(gain, 0) * self._importance[voxel]
+        of_voxel = np.repeat(np.arange(len(voxels)), number)
+        probe = pairs.probe[at]
+        explained, covered = self._explained[voxels], self._covered[voxels]
+        off = self._light[voxels] - explained
+        # |off - t step|^2 at the best t, from scalar products. take: three times as fast as indexing, and this is where the time goes.
+        step = self._light.take(probe, axis=0)
+        step -= explained.take(of_voxel, axis=0)
+        along, length = np.einsum("md,md->m", off.take(of_voxel, axis=0), step), np.einsum("md,md->m", step, step)
+        share = np.clip(along / np.maximum(length, 1e-12), 0, 1)
+        fall = share * (2 * along - share * length)
+        # A voxel without any probe takes all of its first one's light, whatever it misses.
+        bare = ~covered.take(of_voxel)
+        if bare.any():
+            own = np.einsum("kd,kd->k", off, off).take(of_voxel)
+            fall = np.where(bare, UNLIT - (own - 2 * along + length), fall)
+        gain = np.maximum(fall, 0) * self._importance[voxels].take(of_voxel)
         self._gain += np.bincount(probe, gain - self._pair_gain[at], len(self._gain))
         self._pair_gain[at] = gain

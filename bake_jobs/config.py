@@ -63,7 +63,7 @@ class BakeSettings:
     probe_budget: int = 1000
     band_m: float = 28.0
     fit_candidates: int = 12
-    fit_ridge: float = 0.002
+    fit_ridge: float = 0.001
     target_error: float = 0.0
 
     def to_json(self) -> dict[str, Any]:

@@ -46,13 +46,13 @@ class SectorBaker:
         self._bake_id = bake_id
         self.rays = RayScene(scene.vertices, scene.triangles)
         self._solids = Solids(scene.vertices, scene.triangles)
-        self._cutter = SectorCutter(scene)
+        self.cutter = SectorCutter(scene)
         self._pattern = gbuffer.cube_map_pattern(settings.rays_per_face_edge)
-        self._trial = self._trial_scene() if settings.placement == "adaptive" or settings.voxel_weights == "fitted" else None
+        self.trial = self._trial_scene() if settings.placement == "adaptive" or settings.voxel_weights == "fitted" else None
 
     def bake(self, index: SectorIndex) -> BakedSector:
         """Both files of one sector."""
-        geometry = self._cutter.cut(index)
+        geometry = self.cutter.cut(index)
         sector, meta = self.bake_arrays(index, geometry)
         return BakedSector(index, sector_file.encode(sector, meta, SKY_FACES), geometry_file.encode(index, geometry, self._bake_id), meta)
 
@@ -119,7 +119,7 @@ class SectorBaker:
 
     def place(self, index: SectorIndex) -> tuple[placement.Placement, adaptive.Trial | None]:
         """Probes, and where the voxels' weights are to be fitted, the trial light."""
-        scene, settings, rays, solids, trial = self._scene, self._settings, self.rays, self._solids, self._trial
+        scene, settings, rays, solids, trial = self._scene, self._settings, self.rays, self._solids, self.trial
         if trial is None:
             return placement.place_probes(rays, solids, scene.bounds, index, settings, scene.rooms, scene.hints), None
         air = find_air(rays, solids, scene.bounds, index, settings, scene.rooms)

@@ -83,7 +83,7 @@ def test_gains_kept_up_to_date_are_those_worked_out_anew():
 
 def test_neighbours_are_all_that_are_near_and_a_thin_lattice_of_those_far():
     lattice = np.stack([a.ravel() for a in np.meshgrid(np.arange(-9, 10), np.arange(3), np.arange(-9, 10), indexing="ij")], axis=1)
-    voxel, probe = neighbour_pairs(lattice)
+    voxel, probe = neighbour_pairs(lattice, np.zeros(lattice.shape, bool))
     assert len({*zip(voxel.tolist(), probe.tolist(), strict=True)}) == len(voxel)
     middle = int(np.flatnonzero((lattice == 0).all(axis=1))[0])
     mine = set(probe[voxel == middle].tolist())
@@ -91,6 +91,14 @@ def test_neighbours_are_all_that_are_near_and_a_thin_lattice_of_those_far():
         distance = np.linalg.norm(place)
         step = 1 if distance <= 2.5 else 2 if distance <= 5 else 4
         assert (number in mine) == (distance <= 8 and (place % step == 0).all())
+
+
+def test_in_a_narrow_strip_every_voxel_may_explain_far_ones():
+    lattice = np.stack([np.ones(20, int), np.zeros(20, int), np.arange(20)], axis=1)
+    for across in (False, True):
+        _, probe = neighbour_pairs(lattice, np.tile([across, False, False], (20, 1)))
+        assert (np.bincount(probe)[4] == 17 - 4) == across  # itself, four before, eight after
+        assert np.bincount(probe)[5] == 5
 
 
 def small_problems(count, candidates=6, rows=12, seed=0):
