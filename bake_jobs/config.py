@@ -45,6 +45,16 @@ class BakeSettings:
     voxel_probes : probes that a voxel blends at most
     voxel_candidates : nearest probes that are tested for visibility from a voxel
     feedback_probes : probes that light a surfel, the closest of those that see it; more: smoother bounces, more to do at each relight
+    placement : "grid", ground grid and walls; "adaptive", where light changes (bake_jobs/adaptive.py)
+    voxel_weights : "nearest", visible probes by distance; "fitted", to trial light (bake_jobs/fit.py)
+    trial_rays_per_face_edge : of the trial light at every voxel; more: less noise in what placement and weights follow
+    probe_worth : adaptive placement goes on until a probe takes less than this off the squared relative errors of the voxels that see it,
+        summed; less: more probes
+    probe_budget : adaptive probes of a sector at most, margin included
+    band_m [m] : adaptive probes stand up to this high above the street; above, a few carry the light
+    fit_candidates : visible probes that a voxel's weights are fitted over
+    fit_ridge : pull of fitted weights towards inverse distance; more: smoother, less exact
+    target_error : probes are added until the bake's own estimate of the error near surfaces is below; 0: probe_worth alone decides
     """
 
     preset: str = "talk"
@@ -65,6 +75,15 @@ class BakeSettings:
     voxel_probes: int = 4
     voxel_candidates: int = 8
     feedback_probes: int = 1
+    placement: Literal["grid", "adaptive"] = "grid"
+    voxel_weights: Literal["nearest", "fitted"] = "nearest"
+    trial_rays_per_face_edge: int = 8
+    probe_worth: float = 0.01
+    probe_budget: int = 1000
+    band_m: float = 28.0
+    fit_candidates: int = 12
+    fit_ridge: float = 0.001
+    target_error: float = 0.0
 
     @property
     def sky_sources(self) -> int:
@@ -101,6 +120,17 @@ def with_knobs(settings: BakeSettings, knobs: Sequence[str]) -> BakeSettings:
         if choices is None and not low <= float(value) <= high:
             raise InputError(f"knob {knob[:60]!r}: expected {low:g} to {high:g}")
     return replace(settings, preset=", ".join([settings.preset, *knobs]), **turned)  # type: ignore[arg-type]
+
+
+# What placement="adaptive" and voxel_weights="fitted" want of the other knobs: both tuned together (gi_core/MATH.md).
+ADAPTIVE: dict[str, Any] = {"placement": "adaptive", "voxel_weights": "fitted", "voxel_candidates": 24, "margin_m": 3.2}
+
+
+def with_target_error(settings: BakeSettings, target_error: float) -> BakeSettings:
+    """Settings that place probes adaptively until an error is met. Raises InputError for one that no bake can be asked for."""
+    if not 0.001 <= target_error <= 1.0:
+        raise InputError(f"--target-error {target_error:g}: expected a relative error of 0.001..1, as in 0.04")
+    return replace(settings, **ADAPTIVE, target_error=target_error)
 
 
 def settings_for(preset: str) -> BakeSettings:

@@ -66,11 +66,11 @@ def place_probes(
     low, high = index.origin[[0, 2]] - reach, index.origin[[0, 2]] + SECTOR_SIZE_M + reach
     ground = _ground_candidates(ray_scene, bounds, low, high, settings)
     wall = _wall_candidates(ray_scene, bounds, low, high, settings)
-    asked = _asked_candidates(hints, low, high)
+    asked = asked_positions(hints, low, high)
     position = np.concatenate([asked, ground, wall])
     flags = np.repeat(np.array([0, PROBE_ON_GROUND, PROBE_ON_WALL], np.uint8), [len(asked), len(ground), len(wall)])
 
-    allowed = ~_in_boxes(position, [h for h in hints if h.kind == "forbid"])
+    allowed = ~in_boxes(position, [h for h in hints if h.kind == "forbid"])
     position, flags = position[allowed], flags[allowed]
     room = room_of(position, rooms)
     # An authored room is air, whatever way its walls were modelled.
@@ -202,7 +202,7 @@ def _wall_candidates(ray_scene: RayScene, bounds: Float64, low: Float64, high: F
     return position[order]
 
 
-def _asked_candidates(hints: tuple[ProbeHint, ...], low: Float64, high: Float64) -> Float64:
+def asked_positions(hints: tuple[ProbeHint, ...], low: Float64, high: Float64) -> Float64:
     boxes = [np.empty((0, 3))]
     for hint in hints:
         if hint.kind != "add":
@@ -215,7 +215,7 @@ def _asked_candidates(hints: tuple[ProbeHint, ...], low: Float64, high: Float64)
     return np.concatenate(boxes)
 
 
-def _in_boxes(position: Float64, boxes: list[ProbeHint]) -> Bool:
+def in_boxes(position: Float64, boxes: list[ProbeHint]) -> Bool:
     inside = np.zeros(len(position), bool)
     for box in boxes:
         inside |= ((position >= box.minimum) & (position <= box.maximum)).all(axis=1)

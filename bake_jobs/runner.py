@@ -24,7 +24,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from bake_jobs.config import BakeSettings, settings_for, with_knobs
+from bake_jobs.config import BakeSettings, settings_for, with_knobs, with_target_error
 from bake_jobs.geometry_clip import SectorCutter
 from bake_jobs.scene import Scene, scene_digest
 from bake_jobs.scene_source import load_scene
@@ -32,7 +32,7 @@ from bake_jobs.sector_job import SectorBaker
 from bake_jobs.summary import print_summary
 from gi_core import distant_file, geometry_file, sector_file
 from gi_core.container import write_atomic
-from gi_core.dataset import DISTANT_FILE, WORLD_FILE, SectorFacts, WorldInfo, geometry_path, sector_path, write_world
+from gi_core.dataset import COUNTS, DISTANT_FILE, WORLD_FILE, SectorFacts, WorldInfo, geometry_path, sector_path, write_world
 from gi_core.errors import FormatError, InputError, SectorlightError
 from gi_core.grid import SectorIndex
 from gi_core.json_fields import LARGEST_INTEGER
@@ -85,17 +85,22 @@ def bake(
     restart: bool = False,
     console: Console | None = None,
     knobs: Sequence[str] = (),
+    target_error: float | None = None,
 ) -> WorldInfo:
     """Bake a source into a dataset folder and print a summary.
 
     jobs : worker processes; None takes every core. sectors : half-open ranges ((x0, x1), (z0, z1)); None takes all.
     restart : bake everything anew instead of skipping finished sectors. seed : recorded with the dataset. knobs : ``config.with_knobs``.
 
+    target_error : spend probes until the bake's own estimate of each sector is below, at most 1000 a sector; None leaves it to the preset
+
     Raises InputError (SourceError among them) for input that cannot be baked, WorkerLostError when a worker dies, DatasetWriteError
     when the folder cannot be written. An interrupt leaves finished sectors in place, and the same call resumes.
     """
     console = console or Console(stderr=True)
     settings = with_knobs(settings_for(quality), knobs) if knobs else settings_for(quality)
+    if target_error is not None:
+        settings = with_target_error(settings, target_error)
     if not 0 <= seed <= LARGEST_INTEGER:
         raise InputError(f"seed: expected a whole number of 0..{LARGEST_INTEGER}, found {seed}")
     if output.exists() and not output.is_dir():
@@ -193,9 +198,11 @@ def _clear(output: Path) -> None:
 
 
 def _facts(sector_bytes: bytes, geometry_bytes: int, meta: dict[str, Any]) -> SectorFacts:
-    counted = {name: int(meta[name]) for name in SectorFacts.__dataclass_fields__ if name not in ("bytes", "digest", "geometry_bytes")}
+    counted = {name: int(meta[name]) for name in COUNTS if name not in ("bytes", "geometry_bytes")}
     digest = hashlib.blake2b(sector_bytes, digest_size=16).hexdigest()
-    return SectorFacts(bytes=len(sector_bytes), digest=digest, geometry_bytes=geometry_bytes, **counted)
+    return SectorFacts(
+        bytes=len(sector_bytes), digest=digest, geometry_bytes=geometry_bytes, estimated_error=meta.get("estimated_error"), **counted
+    )
 
 
 def _finished(output: Path, index: SectorIndex, bake_id: str) -> _Finished | None:

@@ -23,7 +23,8 @@ class DroppedTriangles:
 
 @dataclass(frozen=True)
 class ProbeHint:
-    """A box in which the author wants probes added ("add", spaced by spacing_m) or none ("forbid")."""
+    """A box in which the author wants probes added ("add", spaced by spacing_m), none ("forbid"), or more of those that adaptive placement
+    finds ("densify")."""
 
     kind: str
     minimum: tuple[float, float, float]

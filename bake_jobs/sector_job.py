@@ -5,12 +5,16 @@ from typing import Any
 
 import numpy as np
 
-from bake_jobs import factors, gbuffer, placement, sun_visibility, surfels, voxels
+from bake_jobs import adaptive, factors, gbuffer, placement, sun_visibility, surfels, voxels
+from bake_jobs.air import find_air
 from bake_jobs.config import BakeSettings
 from bake_jobs.geometry_clip import SectorCutter
 from bake_jobs.inside import Solids
 from bake_jobs.rays import RayScene
 from bake_jobs.scene import Scene
+from bake_jobs.target_error import probes_for_target
+from bake_jobs.trial_light import TrialScene
+from bake_jobs.trial_states import trial_states
 from gi_core import geometry_file, sector_file
 from gi_core.arrays import Float32, Float64
 from gi_core.constants import ALBEDO_MAX, ROOM_OUTDOORS
@@ -38,29 +42,31 @@ class SectorBaker:
         self._settings = settings
         self._sun_directions = sun_directions
         self._bake_id = bake_id
-        self._rays = RayScene(scene.vertices, scene.triangles)
+        self.rays = RayScene(scene.vertices, scene.triangles)
         self._solids = Solids(scene.vertices, scene.triangles)
-        self._cutter = SectorCutter(scene)
+        self.cutter = SectorCutter(scene)
         self._pattern = gbuffer.cube_map_pattern(settings.rays_per_face_edge, settings.basis)
+        self.trial = self._trial_scene() if settings.placement == "adaptive" or settings.voxel_weights == "fitted" else None
 
     def bake(self, index: SectorIndex) -> BakedSector:
         """Both files of one sector."""
-        geometry = self._cutter.cut(index)
+        geometry = self.cutter.cut(index)
         sector, meta = self.bake_arrays(index, geometry)
         sector_bytes = sector_file.encode(sector, meta, self._settings.sky_sources)
         return BakedSector(index, sector_bytes, geometry_file.encode(index, geometry, self._bake_id), meta)
 
     def bake_arrays(self, index: SectorIndex, geometry: Geometry) -> tuple[Sector, dict[str, Any]]:
         """One sector's arrays before quantisation, and its meta. ``geometry`` is what SectorCutter.cut gives for it."""
-        scene, settings, rays = self._scene, self._settings, self._rays
-        placed = placement.place_probes(rays, self._solids, scene.bounds, index, settings, scene.rooms, scene.hints)
+        scene, settings, rays = self._scene, self._settings, self.rays
+        placed, trial = self.place(index)
         seen = gbuffer.render(rays, placed.position, self._pattern)
         room = surfels.rooms_of_hits(seen, placed.room, scene.rooms)
         clustered = surfels.cluster(seen, room, index.origin, scene.albedo, scene.emission, settings.cells_double_beyond_m)
         weights = factors.gather(seen, self._pattern, clustered, None if settings.sky == "faces" else settings.sky_patches)
         feedback_probe, feedback_weight = surfels.feedback(clustered, seen, settings.feedback_probes)
         heights = geometry.vertices[:, 1] if len(geometry.vertices) else np.zeros(1)
-        lattice = voxels.bake_voxels(rays, self._solids, np.array([heights.min(), heights.max()]), index, placed, settings, scene.rooms)
+        surfaces = np.array([heights.min(), heights.max()])
+        lattice = voxels.bake_voxels(rays, self._solids, surfaces, index, placed, settings, scene.rooms, trial)
         emits = bool(clustered.emission.any())
         sector = Sector(
             index=index,
@@ -101,7 +107,33 @@ class SectorBaker:
             "voxels_blind": lattice.blind,
             "distant_sky": _distant_sky(weights.sky, placed),
         }
+        if lattice.estimated_error is not None:
+            meta["estimated_error"] = round(lattice.estimated_error, 5)
         return sector, meta
+
+    def _trial_scene(self) -> TrialScene:
+        scene = self._scene
+        states = trial_states(self._sun_directions, bool(scene.lamps) or bool(scene.emission.any()))
+        return TrialScene(self.rays, scene.albedo, scene.emission, scene.lamps, states, self._settings.trial_rays_per_face_edge)
+
+    def place(self, index: SectorIndex) -> tuple[placement.Placement, adaptive.Trial | None]:
+        """Probes, and where the voxels' weights are to be fitted, the trial light."""
+        scene, settings, rays, solids, trial = self._scene, self._settings, self.rays, self._solids, self.trial
+        if trial is None:
+            return placement.place_probes(rays, solids, scene.bounds, index, settings, scene.rooms, scene.hints), None
+        air = find_air(rays, solids, scene.bounds, index, settings, scene.rooms)
+        light = trial.light(air.centre)
+        if settings.placement == "adaptive":
+            ranking = adaptive.rank_probes(rays, solids, index, settings, scene.rooms, scene.hints, air, light, trial)
+            count = min(ranking.enough, settings.probe_budget)
+            if settings.target_error:
+                count = probes_for_target(rays, ranking, trial.states, air, light, settings)
+            placed, cube = ranking.first(count)
+        else:
+            placed = placement.place_probes(rays, solids, scene.bounds, index, settings, scene.rooms, scene.hints)
+            cube = trial.light(placed.position).cube
+        fitted = adaptive.Trial(trial.states, air, light, cube) if settings.voxel_weights == "fitted" else None
+        return placed, fitted
 
 
 def _distant_sky(sky: Float32, placed: placement.Placement) -> list[float]:

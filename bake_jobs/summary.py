@@ -4,6 +4,19 @@ from rich.console import Console
 from rich.table import Table
 
 from gi_core.dataset import WorldInfo
+from gi_core.grid import SectorIndex
+
+# So many sectors are named when they miss their target; world.json has all.
+LISTED = 10
+
+
+def missed_target(world: WorldInfo) -> list[tuple[SectorIndex, float]]:
+    """Sectors whose estimated error is above the bake's target, and what it is; the worst first."""
+    target = world.settings.get("target_error", 0)
+    found = [
+        (i, f.estimated_error) for i, f in world.sectors.items() if target and f.estimated_error is not None and f.estimated_error > target
+    ]
+    return sorted(found, key=lambda pair: (-pair[1], pair[0]))
 
 
 def print_summary(console: Console, world: WorldInfo, core_seconds: float, wall_seconds: float, baked: int, workers: int) -> None:
@@ -20,8 +33,15 @@ def print_summary(console: Console, world: WorldInfo, core_seconds: float, wall_
     if baked:
         table.add_row("core time", f"{core_seconds:,.1f} s", f"{core_seconds / baked:,.2f} s")
         table.add_row(f"time, {workers} processes", f"{wall_seconds:,.1f} s", f"{wall_seconds / baked:,.2f} s")
+    if world.estimated_error is not None:
+        table.add_row("estimated error", "", f"{100 * world.estimated_error:.1f} %")
     console.print(table)
     crowded = sum(1 for facts in world.sectors.values() if facts.probes_dropped)
+    missed = missed_target(world)
+    if missed:
+        shown = ", ".join(f"{i.x},{i.z} ({100 * error:.1f} %)" for i, error in missed[:LISTED])
+        more = f" and {len(missed) - LISTED} more" if len(missed) > LISTED else ""
+        console.print(f"{len(missed)} sectors miss the target error of {100 * world.settings['target_error']:g} %: {shown}{more}")
     notes = [
         (counts["probes_dropped"], f"probes beyond 1000 a sector were dropped, in {crowded} sectors"),
         (counts["probes_dead"], "candidate probes lay inside solids"),

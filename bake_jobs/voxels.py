@@ -3,6 +3,8 @@
 A voxel in free air blends the closest probes that it sees. One that sees none of them, and one in a solid, blends what the nearest air
 does that sees some: light does not end at a pillar, and trilinear sampling at a wall never turns dark. Indoors such a voxel takes the
 closest probe of its room instead, since the nearest air may be another's.
+
+Weights go by distance, or where light was tried out they are fitted to it (``voxel_weights="fitted"``).
 """
 
 from dataclasses import dataclass
@@ -11,17 +13,18 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
+from bake_jobs.adaptive import Trial
 from bake_jobs.config import BakeSettings
 from bake_jobs.inside import Solids
 from bake_jobs.placement import Placement, room_of
 from bake_jobs.rays import SURFACE_OFFSET_M, RayScene
+from bake_jobs.trial_fit import TrialFit
+from bake_jobs.voxel_classes import FILL_MARGIN, solid_voxels
 from gi_core.arrays import Bool, Float32, Float64, Int32, Int64, UInt8, UInt16
 from gi_core.constants import ROOM_OUTDOORS, VOXEL_INDOORS, VOXEL_OUTDOORS, VOXEL_SIZE_M, VOXEL_SOLID
 from gi_core.grid import SectorIndex, voxel_centre, voxel_columns
 from gi_core.world import Room
 
-# Solid voxels at a border take the nearest air of this many columns beyond it too, as the neighbour's own would.
-FILL_MARGIN = 2
 # Air is stored this far above a sector's highest surface, and at least this far above its lowest: half a volume, for a player who
 # stands in the street.
 AIR_ABOVE_TOP_M = 4.0
@@ -30,7 +33,8 @@ AIR_ABOVE_GROUND_M = 28.0
 
 @dataclass(frozen=True, eq=False)
 class Voxels:
-    """Arrays as gi_core.sector describes them, and ``blind``: how many free voxels see none of their closest probes."""
+    """Arrays as gi_core.sector describes them; ``blind``: how many free voxels see none of their closest probes; ``estimated_error``: of
+    fitted weights (TrialFit)."""
 
     first: Int32
     kind: UInt8
@@ -38,6 +42,7 @@ class Voxels:
     probe: UInt16
     weight: Float32
     blind: int
+    estimated_error: float | None = None
 
 
 def bake_voxels(
@@ -48,15 +53,18 @@ def bake_voxels(
     placement: Placement,
     settings: BakeSettings,
     rooms: tuple[Room, ...],
+    trial: Trial | None = None,
 ) -> Voxels:
-    """Voxels of a sector. ``surfaces`` (2,) [m] are the lowest and highest surface in it."""
+    """Voxels of a sector. ``surfaces`` (2,) [m] are the lowest and highest surface in it; weights are fitted to ``trial`` where it has
+    light, and go by distance elsewhere."""
     lattice, shape = _lattice(index, surfaces)
     centre = voxel_centre(lattice.reshape(-1, 3))
     room = room_of(centre, rooms)
     kind = np.where(room == ROOM_OUTDOORS, VOXEL_OUTDOORS, VOXEL_INDOORS).astype(np.uint8)
     # An authored room is air, whatever way its walls were modelled.
-    kind[(room == ROOM_OUTDOORS) & _solid(ray_scene, solids, centre.reshape(*shape, 3)).reshape(-1)] = VOXEL_SOLID
-    probe, weight, blind = _blend(ray_scene, centre, kind, room, placement, settings)
+    kind[(room == ROOM_OUTDOORS) & solid_voxels(ray_scene, solids, centre.reshape(*shape, 3)).reshape(-1)] = VOXEL_SOLID
+    fit = None if trial is None else TrialFit(trial, lattice.reshape(-1, 3), settings)
+    probe, weight, blind = blend(ray_scene, centre, kind, room, placement, settings, fit)
     source = _nearest((kind != VOXEL_SOLID) & ~(blind & (room == ROOM_OUTDOORS)), shape)
     probe, weight = probe[source], weight[source]
 
@@ -70,6 +78,7 @@ def bake_voxels(
         probe=np.ascontiguousarray(probe.reshape(*shape, k)[inner]),
         weight=np.ascontiguousarray(weight.reshape(*shape, k)[inner]),
         blind=int(blind.sum()),
+        estimated_error=None if fit is None else fit.estimated_error,
     )
 
 
@@ -84,24 +93,14 @@ def _lattice(index: SectorIndex, surfaces: Float64) -> tuple[Int64, tuple[int, i
     return np.stack([x, y, z], axis=-1), (len(ranges[0]), len(ranges[1]), len(ranges[2]))
 
 
-def _solid(ray_scene: RayScene, solids: Solids, centre: Float64) -> Bool:
-    """(ny, nz, nx) bool: which voxel centres (ny, nz, nx, 3) lie in a solid.
-
-    Voxels of a column with nothing between them are alike, so the middle one of each run is tested: a seventh of them, in midtown.
-    """
-    ny, nz, nx = centre.shape[:3]
-    below = centre[:-1].reshape(-1, 3)
-    up = np.tile(np.array([[0, 1, 0]], np.float32), (len(below), 1))
-    cut = ray_scene.occluded(below, up, np.full(len(below), VOXEL_SIZE_M)).reshape(ny - 1, nz, nx)
-    run_in_column = np.concatenate([np.zeros((1, nz, nx), np.int64), np.cumsum(cut, axis=0)])
-    run = run_in_column + ny * np.arange(nz * nx).reshape(nz, nx)
-    _, first, of_voxel, length = np.unique(run, return_index=True, return_inverse=True, return_counts=True)
-    middle = first + length // 2 * (nz * nx)
-    return solids.contain(centre.reshape(-1, 3)[middle])[of_voxel.reshape(ny, nz, nx)]
-
-
-def _blend(
-    ray_scene: RayScene, centre: Float64, kind: UInt8, room: UInt16, placement: Placement, settings: BakeSettings
+def blend(
+    ray_scene: RayScene,
+    centre: Float64,
+    kind: UInt8,
+    room: UInt16,
+    placement: Placement,
+    settings: BakeSettings,
+    fit: TrialFit | None,
 ) -> tuple[UInt16, Float32, Bool]:
     """Probes (V, K) and weights (V, K) of all voxels, zero where a voxel is solid; which voxels (V,) see none and take the closest."""
     k = settings.voxel_probes
@@ -123,8 +122,10 @@ def _blend(
         blind_member = ~sees.any(axis=1)
         sees[blind_member, 0] = True
         blind[members] = blind_member
-        rank = np.cumsum(sees, axis=1)
-        share = np.where(sees & (rank <= k), 1 / np.maximum(distance, 0.25) ** 2, 0)
+        closeness = np.where(sees, 1 / np.maximum(distance, 0.25) ** 2, 0)
+        share = np.where(np.cumsum(sees, axis=1) <= k, closeness, 0)
+        if fit is not None:
+            share = fit.shares(members, near, closeness, share)
         best = np.argsort(-share, axis=1, kind="stable")[:, :k]
         rows = np.arange(len(members))[:, None]
         probe[members, : best.shape[1]] = near[rows, best]

@@ -33,7 +33,7 @@ size = [1.0, 1.0]                      # of an area, width and height; the width
 schedule = "always"                    # or "night", or local times: "18:00-23:30"
 
 [[hint]]
-kind = "add"                           # add, or forbid
+kind = "add"                           # add, forbid, or densify: more where light changes (adaptive placement)
 minimum = [0.0, 0.0, 0.0]
 maximum = [8.0, 4.0, 6.0]
 spacing_m = 2.0
@@ -54,7 +54,7 @@ from bake_jobs.table import Table, read_toml
 from gi_core.errors import SourceError
 from gi_core.world import Location, Room
 
-HINT_KINDS = ("add", "forbid")
+HINT_KINDS = ("add", "forbid", "densify")
 MAX_ROOMS = 65_535  # a sector stores room numbers as uint16, and 0 is outdoors
 Loader = Callable[[Path, MapFrame | None], SourceContent]
 

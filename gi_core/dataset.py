@@ -43,7 +43,11 @@ MAX_LAMPS = 1 << 20
 
 @dataclass(frozen=True)
 class SectorFacts:
-    """What world.json says of one sector: its files' bytes and digest, and what the bake counted."""
+    """What world.json says of one sector: its files' bytes and digest, and what the bake counted.
+
+    estimated_error : median relative error that the bake expects of voxels near surfaces from interpolation alone; None where it tried
+        out no light, or the sector has no such voxel
+    """
 
     bytes: int
     digest: str
@@ -57,6 +61,14 @@ class SectorFacts:
     probes_dead: int
     probes_dropped: int
     voxels_blind: int
+    estimated_error: float | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """The object in world.json; without an estimate there is no member for it."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
+
+
+COUNTS = tuple(name for name in SectorFacts.__dataclass_fields__ if name not in ("digest", "estimated_error"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,8 +103,13 @@ class WorldInfo:
     @property
     def counts(self) -> dict[str, int]:
         """Sums over all sectors."""
-        names = [name for name in SectorFacts.__dataclass_fields__ if name != "digest"]
-        return {"sectors": len(self.sectors)} | {name: sum(getattr(f, name) for f in self.sectors.values()) for name in names}
+        return {"sectors": len(self.sectors)} | {name: sum(getattr(f, name) for f in self.sectors.values()) for name in COUNTS}
+
+    @property
+    def estimated_error(self) -> float | None:
+        """Median of the sectors' estimates; None where the bake made none."""
+        found = [facts.estimated_error for facts in self.sectors.values() if facts.estimated_error is not None]
+        return float(np.median(found)) if found else None
 
     @property
     def version(self) -> int:
@@ -116,7 +133,7 @@ class WorldInfo:
             "settings": self.settings,
             "seed": self.seed,
             "sun_table": self.sun_table.to_json(),
-            "sectors": {f"{i.x},{i.z}": asdict(self.sectors[i]) for i in sorted(self.sectors)},
+            "sectors": {f"{i.x},{i.z}": self.sectors[i].to_json() for i in sorted(self.sectors)},
             "rooms": [asdict(room) for room in self.rooms],
             "lamps": [asdict(lamp) for lamp in self.lamps],
             "dropped_triangles": self.dropped_triangles,
@@ -168,6 +185,7 @@ class WorldInfo:
         )
 
 
+_OPTIONAL_FACTS = frozenset({"estimated_error"})
 _TOP_LEVEL = frozenset(WorldInfo.__dataclass_fields__) | {"format", "version"}
 _SECTOR_KEY = re.compile(r"(-?\d{1,7}),(-?\d{1,7})", re.ASCII)
 
@@ -191,9 +209,11 @@ def _sectors(top: Fields) -> dict[SectorIndex, SectorFacts]:
         # One spelling for each sector: neither 01,0 nor -0,0.
         if match is None or f"{int(match[1])},{int(match[2])}" != key or max(abs(int(n)) for n in match.groups()) > MAX_SECTOR_COORDINATE:
             raise CorruptFileError(f"{top.where}: sectors: expected keys such as 3,-2, found {key[:40]!a}; bake it again")
-        facts = Fields(record, f"{top.where}: sectors: {key}", SectorFacts.__dataclass_fields__)
-        counted = {name: facts.integer(name) for name in SectorFacts.__dataclass_fields__ if name != "digest"}
-        sectors[SectorIndex(int(match[1]), int(match[2]))] = SectorFacts(digest=facts.text("digest"), **counted)
+        given = _OPTIONAL_FACTS & set(record) if isinstance(record, dict) else frozenset()
+        facts = Fields(record, f"{top.where}: sectors: {key}", {*COUNTS, "digest", *given})
+        counted = {name: facts.integer(name) for name in COUNTS}
+        estimate = facts.number("estimated_error", 0.0) if given else None
+        sectors[SectorIndex(int(match[1]), int(match[2]))] = SectorFacts(digest=facts.text("digest"), estimated_error=estimate, **counted)
     return sectors
 
 

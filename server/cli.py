@@ -108,6 +108,9 @@ def bake(
     seed: Annotated[int, typer.Option(min=0, help="Same source, settings and seed give the same bytes.")] = 0,
     knob: Annotated[list[str] | None, typer.Option(help="A setting of the preset, NAME=VALUE as in basis=cube; repeatable.")] = None,
     restart: Annotated[bool, typer.Option("--restart/--resume", help="Bake finished sectors again, or keep them.")] = False,
+    target_error: Annotated[
+        float | None, typer.Option(help="Place probes by light until the bake's own estimate is below, as in 0.04; at most 1000 a sector.")
+    ] = None,
 ) -> None:
     """Bake a city into a dataset. Interrupted with Ctrl-C, it keeps the sectors that are finished, and the same command bakes the rest."""
     if quality in LATER_PRESETS:
@@ -119,7 +122,7 @@ def bake(
         from bake_jobs.runner import bake as run
 
         with writing(output):
-            run(source, output, quality, jobs, chosen, seed, restart, knobs=knob or ())
+            run(source, output, quality, jobs, chosen, seed, restart, knobs=knob or (), target_error=target_error)
     except KeyboardInterrupt:
         kept = sum(1 for _ in output.glob("sectors/*.gisec"))
         again = " (without --restart)" if restart else ""

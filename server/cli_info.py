@@ -35,6 +35,7 @@ def show_dataset(path: Path) -> None:
         "sector files": f"{total_bytes:,} bytes" + (f", {total_bytes / len(world.sectors):,.0f} a sector" if world.sectors else ""),
         "bytes per probe": f"{total_bytes / probes:,.0f}" if probes else "no probe",
         "rooms, lamps": f"{len(world.rooms)}, {len(world.lamps)}",
+        "estimated error": "none was made" if world.estimated_error is None else f"{100 * world.estimated_error:.1f} % (median of sectors)",
     }
     console = Console()
     console.print(_table("Dataset", facts), _table("Counts", world.counts), _table("Settings", world.settings))
@@ -66,6 +67,7 @@ def show_sector(path: Path, text: str) -> None:
         "surfels": sector.surfel_count,
         "sun planes": len(sector.sun_visibility),
         "voxels": f"{sector.voxel_class.size:,}, {free:,} in free air",
+        "estimated error": "none was made" if facts.estimated_error is None else f"{100 * facts.estimated_error:.1f} %",
         "geometry": f"{len(dataset.geometry(index).triangles):,} triangles",
     }
     Console().print(_table(f"Sector {index.x},{index.z}", rows))

@@ -1,0 +1,187 @@
+"""Adaptive placement in whole sectors: the same probes on both sides of a border, no seam, hints, budgets, and nothing in solids."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bake_jobs.config import ADAPTIVE, settings_for, with_target_error
+from bake_jobs.placement import Placement
+from bake_jobs.scene import ProbeHint
+from bake_jobs.sector_job import SectorBaker
+from gi_core.constants import MAX_PROBES_PER_SECTOR, ROOM_OUTDOORS, VOXEL_OUTDOORS
+from gi_core.errors import InputError
+from gi_core.grid import SectorIndex, voxel_centre
+from gi_core.sector import PROBE_IN_MARGIN
+from gi_core.world import Room
+
+SUNS = np.array(
+    [[0.1, 0.99, 0.1], [0.6, 0.75, 0.28], [-0.6, 0.75, 0.28], [0.28, 0.55, 0.79], [0.85, 0.5, 0.17], [-0.85, 0.5, 0.17], [0, 0.3, 0.95]]
+)
+QUICK = {**ADAPTIVE, "rays_per_face_edge": 4, "trial_rays_per_face_edge": 5}
+BAND_TOP_M = 28.2  # above it stand a few probes that neighbours do not share
+HALL = Room("hall", (20.0, 0.0, 20.0), (29.0, 8.0, 29.0))
+
+
+def baker(scene, **settings) -> SectorBaker:
+    suns = SUNS / np.linalg.norm(SUNS, axis=1, keepdims=True)
+    return SectorBaker(scene, replace(settings_for("talk"), **{**QUICK, **settings}), suns, "test")
+
+
+def placed(scene, index=(0, 0), **settings) -> Placement:
+    return baker(scene, **settings).place(SectorIndex(*index))[0]
+
+
+def within(position, low, high):
+    return ((position > np.asarray(low)) & (position < np.asarray(high))).all(axis=1)
+
+
+def street(build):
+    """Houses on both sides of the border x = 64, one across it, and an alley 4 m wide."""
+    houses = build().ground(low=(-200, -200), high=(328, 264))
+    for low, high in (
+        ((40, 0, 4), (60, 22, 20)),
+        ((66, 0, 4), (90, 31, 21.3)),
+        ((58.5, 0, 30.2), (71.7, 14, 44)),
+        ((30.3, 0, 48), (63.2, 9, 60)),
+        ((68.5, 0, 50), (80, 17, 60.6)),
+    ):
+        houses.box(low, high)
+    return houses.scene()
+
+
+@pytest.fixture(scope="module")
+def west_and_east(build):
+    bench = baker(street(build))
+    return bench, [bench.place(SectorIndex(x, 0)) for x in (0, 1)]
+
+
+def test_an_empty_plaza_gets_few_probes_and_an_alley_many(build):
+    plaza = placed(build().ground(low=(-200, -200), high=(264, 264)).scene())
+    alleys = build().ground(low=(-200, -200), high=(264, 264))
+    for x in range(-18, 82, 16):
+        alleys.box((x, 0, -20), (x + 11.7, 18, 84))
+    crowded = placed(alleys.scene())
+    assert 0 < len(plaza.position) < 110
+    assert len(crowded.position) > 1.8 * len(plaza.position)
+
+
+def test_margin_probes_are_the_neighbours_own(west_and_east):
+    strips = []
+    for place, _ in west_and_east[1]:
+        chosen = within(place.position, (64 - 3.2, -10, -3.2), (64 + 3.2, BAND_TOP_M, 67.2))
+        own = (place.position[chosen, 0] < 64) == (place is west_and_east[1][0][0])
+        own &= within(place.position[chosen], (0, -10, 0), (128, 100, 64))
+        assert ((place.flags[chosen] & PROBE_IN_MARGIN == 0) == own).all()
+        strips.append({tuple(p) for p in place.position[chosen].tolist()})
+    assert len(strips[0]) > 20
+    assert strips[0] == strips[1]
+
+
+def test_no_seam_shows(west_and_east):
+    """Steps between voxels on both sides of the border are no higher than those of the light itself."""
+    bench, _ = west_and_east
+    blended, exact, air = [], [], []
+    for x in (0, 1):
+        index = SectorIndex(x, 0)
+        sector, _ = bench.bake_arrays(index, bench.cutter.cut(index))
+        cube = bench.trial.light(sector.probe_position.astype(np.float64) + index.origin).cube
+        low = -1 - sector.voxel_first[1]  # nine layers from under the street
+        rows = slice(low, low + 9), slice(None), slice(-4, None) if x == 0 else slice(0, 4)
+        ny, nz, nx = sector.voxel_class[rows].shape
+        at = np.stack(np.meshgrid(np.arange(ny) + low, np.arange(nz), np.arange(nx), indexing="ij"), axis=-1)[..., [2, 0, 1]]
+        first = sector.voxel_first + np.array([sector.voxel_class.shape[2] - 4 if x == 0 else 0, 0, 0])
+        truth = bench.trial.light(voxel_centre(first + at.reshape(-1, 3))).cube
+        exact.append(truth.reshape(ny, nz, nx, *truth.shape[1:]))
+        blended.append(np.einsum("yzxk,yzxksf->yzxsf", sector.voxel_weight, cube[sector.voxel_probe])[rows])
+        air.append(sector.voxel_class[rows] == VOXEL_OUTDOORS)
+
+    both = air[0][:, :, 3] & air[1][:, :, 0]
+    steps, true_steps = (
+        np.abs(v[0][:, :, 3][both] - v[1][:, :, 0][both]) / (0.5 * (exact[0][:, :, 3][both] + exact[1][:, :, 0][both]) + 1e-3)
+        for v in (blended, exact)
+    )
+    for share in (0.5, 0.75, 0.95):
+        # Blending smooths more than it steps; the light itself is traced with noise of its own.
+        assert np.quantile(steps, share) < 1.1 * np.quantile(true_steps, share)
+
+
+def test_placement_is_the_same_in_whatever_order_sectors_are_baked(build, west_and_east):
+    again = baker(street(build))
+    for x in (1, 0):
+        place, trial = again.place(SectorIndex(x, 0))
+        before, trial_before = west_and_east[1][x]
+        np.testing.assert_array_equal(place.position, before.position)
+        np.testing.assert_array_equal(trial.probe_cube, trial_before.probe_cube)
+
+
+def test_every_probe_stands_in_air_below_the_band_or_on_the_thin_lattice_above(west_and_east):
+    for place, trial in west_and_east[1]:
+        for low, high in (((40, 0, 4), (60, 22, 20)), ((66, 0, 4), (90, 31, 21.3)), ((58.5, 0, 30.2), (71.7, 14, 44))):
+            assert not within(place.position, low, high).any()
+        assert (place.position[:, 1] > BAND_TOP_M).sum() < 20
+        assert len(trial.probe_cube) == len(place.position) <= MAX_PROBES_PER_SECTOR
+
+
+def test_closed_solids_get_none_and_a_declared_room_is_fed_by_its_own(build):
+    shell = build().ground(low=(-100, -100), high=(164, 164)).box(HALL.minimum, HALL.maximum, inward=True)
+    shell = shell.box((19.7, -0.3, 19.7), (29.3, 8.3, 29.3))
+    closed = placed(shell.scene())
+    assert not within(closed.position, HALL.minimum, HALL.maximum).any()
+    bench = baker(shell.quad((23, 7.9, 23), (3, 0, 0), (0, 0, 3), emission=500.0).scene(rooms=(HALL,)))
+    sector, _ = bench.bake_arrays(SectorIndex(0, 0), bench.cutter.cut(SectorIndex(0, 0)))
+    indoors = sector.voxel_room == 1
+    assert (sector.probe_room == 1).any()
+    for inside, room in ((indoors, 1), (~indoors & (sector.voxel_class == VOXEL_OUTDOORS), ROOM_OUTDOORS)):
+        used = sector.voxel_probe[inside][sector.voxel_weight[inside] > 0]
+        assert (sector.probe_room[used] == room).all()
+    np.testing.assert_allclose(sector.voxel_weight.sum(axis=3), 1, atol=1e-6)
+    assert (sector.voxel_weight >= 0).all()
+
+
+def test_hints_add_forbid_and_densify(build, west_and_east):
+    box = (10.0, 0.0, 10.0), (30.0, 12.0, 30.0)
+    plain = west_and_east[1][0][0].position
+    scene = street(build)
+    forbidden = placed(replace(scene, hints=(ProbeHint("forbid", *box),))).position
+    assert within(plain, *box).any()
+    assert not within(forbidden, *box).any()
+    dense = placed(replace(scene, hints=(ProbeHint("densify", *box),))).position
+    assert within(dense, *box).sum() > within(plain, *box).sum()
+    added = placed(replace(scene, hints=(ProbeHint("add", (10.0, 40.0, 10.0), (20.0, 44.0, 20.0), 2.0),))).position
+    assert within(added, (10, 40, 10), (20, 44, 20)).sum() == 50
+    assert {tuple(p) for p in plain.tolist()} <= {tuple(p) for p in added.tolist()}
+
+
+def test_a_budget_is_kept_and_the_border_comes_first(build, west_and_east):
+    all_of_it = west_and_east[1][0][0]
+    budget = len(all_of_it.position) - 30
+    few = placed(street(build), probe_budget=budget)
+    assert len(few.position) == budget
+    border = within(all_of_it.position, (60.8, -10, 0), (67.2, BAND_TOP_M, 64))
+    assert {tuple(p) for p in all_of_it.position[border].tolist()} <= {tuple(p) for p in few.position.tolist()}
+
+
+def test_a_tighter_target_costs_probes_and_is_met_or_told(build):
+    found = {}
+    for target in (0.15, 0.05):
+        bench = baker(street(build), target_error=target)
+        sector, meta = bench.bake_arrays(SectorIndex(0, 0), bench.cutter.cut(SectorIndex(0, 0)))
+        found[target] = sector.probe_count
+        assert meta["estimated_error"] <= target
+    assert found[0.15] < found[0.05] <= MAX_PROBES_PER_SECTOR
+
+
+def test_a_target_beyond_the_budget_spends_it_and_is_told(build):
+    bench = baker(
+        build().ground(low=(-99, -99), high=(164, 164)).box((20, 0, 20), (30, 9, 44)).scene(), target_error=0.001, probe_budget=120
+    )
+    sector, meta = bench.bake_arrays(SectorIndex(0, 0), bench.cutter.cut(SectorIndex(0, 0)))
+    assert sector.probe_count >= 120
+    assert meta["estimated_error"] > 0.001
+
+
+@pytest.mark.parametrize("target", [0.0, -1.0, 1.5, float("nan")])
+def test_an_impossible_target_is_refused(target):
+    with pytest.raises(InputError, match="--target-error"):
+        with_target_error(settings_for("talk"), target)
