@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from gi_core import relight_twin, shadow_map_twin
-from gi_core.arrays import AnyArray
+from gi_core.arrays import AnyArray, UInt8
 from gi_core.bench import (
     SKY_PATCHES,
     TALK_FACTORS,
@@ -100,6 +100,11 @@ class Ticks:
             resident.set_lamps(lights.buffer)
         self._relighter, self._turn = Relighter(device), itertools.count()
 
+    def sun_moved(self) -> None:
+        """The sun has moved: both sectors are lit, through the samples of the shadow map that they have, and relit."""
+        turn, pair = self._next()
+        self._relight(pair, turn)
+
     def everything(self) -> None:
         """The sun has moved, the shadow map is another: both sectors are sampled, lit and relit."""
         turn, pair = self._next()
@@ -108,11 +113,10 @@ class Ticks:
         self._relight(pair, turn)
 
     def flickering(self) -> None:
-        """``everything``, and all lamps have changed their brightness."""
+        """``sun_moved``, and all lamps have changed their brightness."""
         turn, pair = self._next()
         lamps = [replace(lamp, lumens=7000.0 + (turn * (i + 3)) % 2000) for i, lamp in enumerate(self.lamps)]
         for i in pair:
-            self.shadow_map.sample(self.samples[i])
             self.surfel_lights[i].set_dynamic(lamps)
             self.residents[i].set_lamps(self.surfel_lights[i].buffer)
         self._relight(pair, turn)
@@ -122,7 +126,13 @@ class Ticks:
         _, pair = self._next()
         self._relight(pair, 0)
 
-    def twin(self) -> None:
+    def sun_moved_twin(self) -> None:
+        """``sun_moved`` in NumPy; it finds samples and lamps' light ready as a tick does."""
+        turn, pair = self._next()
+        for i in pair:
+            self._relight_twin(i, turn, self._sun_sample[i])
+
+    def everything_twin(self) -> None:
         """``everything`` in NumPy; it finds lamps' light ready as a tick does."""
         turn, pair = self._next()
         plan = self.shadow_map.plan
@@ -131,13 +141,17 @@ class Ticks:
             sector = self.residents[i].sector
             cell = np.full(sector.surfel_count, SURFEL_CELL_M, np.float32)
             sample, _ = shadow_map_twin.sample(plan, self._depth, sector.surfel_position, sector.surfel_normal, cell, CITY_TOP_M)
-            lamps = self._lamp_light[i]
-            relight_twin.relight(sector, self.given[turn % SUNS], self._cubes[i], 1, lamps=lamps, sun_sample=sample)
+            self._relight_twin(i, turn, sample)
+
+    def _relight_twin(self, i: int, turn: int, sample: UInt8) -> None:
+        sector, lamps = self.residents[i].sector, self._lamp_light[i]
+        relight_twin.relight(sector, self.given[turn % SUNS], self._cubes[i], 1, lamps=lamps, sun_sample=sample)
 
     def read_for_twin(self) -> None:
         """What the twin starts from, so that reading it is not timed."""
         self._depth = self.shadow_map.read()
         self._cubes = [resident.read_cubes() for resident in self.residents]
+        self._sun_sample = [samples.read()[0] for samples in self.samples]
         self._lamp_light: list[AnyArray] = []
         for lights, resident in zip(self.surfel_lights, self.residents, strict=True):
             light = np.zeros((resident.sector.surfel_count, 4), np.float32)
@@ -157,13 +171,15 @@ class Ticks:
 def bench_ticks(device: Device, rounds: int = 15) -> list[Measurement]:
     """Ticks of two sectors, host and device, each with one bounce.
 
-    ``relight_two_sectors`` is the worst: sun, sky, snow, lamps and feedback, the sun at every tick elsewhere, both sectors' shadow-map
-    samples taken anew. Snow and lamps stay as they are; ``_flicker`` changes 16 lamps at every tick too, ``_settled`` nothing.
-    ``relight_host`` makes the worst tick's calls for sectors of one probe and one brick: Python and driver.
+    ``relight_two_sectors`` has all there is: sun, sky, samples of the shadow map, snow, 16 lamps and feedback, the sun at every tick
+    elsewhere. Samples, snow and lamps stay as they are. ``_resampled`` takes both sectors' samples anew too, as the live world does when a
+    map was drawn, every quarter of a degree of the sun; ``_flicker`` changes 16 lamps at every tick, ``_settled`` nothing.
+    ``relight_host`` makes the calls of ``_resampled`` for sectors of one probe and one brick: Python and driver.
     """
     ticks, tiny = Ticks(device, snowy_sectors()), Ticks(device, [talk_size_sector(seed, 1, 1, 1 + SKY_PATCHES) for seed in range(ROTATION)])
     for _ in range(ROTATION):
         ticks.flickering()
+        ticks.everything()
         tiny.everything()
     ticks.read_for_twin()
     sizes = {"sectors": 2, "probes": TALK_PROBES, "surfels": TALK_SURFELS, "factors": TALK_FACTORS}
@@ -172,19 +188,13 @@ def bench_ticks(device: Device, rounds: int = 15) -> list[Measurement]:
         median, baseline = (1e3 * s for s in side_by_side(run, beside, rounds, calls=20))
         return Measurement(name, median, "ms", baseline, baseline / median, sizes, device.name, what)
 
-    moves = "NumPy twin, float32; each tick: sun moves, shadow map resampled"
+    lit, all_of = sizes | {"lamps": LAMPS}, "relight_two_sectors"
     return [
-        row("relight_two_sectors", ticks.everything, ticks.twin, rounds, moves, sizes | {"lamps": LAMPS}),
-        row("relight_two_sectors_settled", ticks.settled, ticks.everything, 5 * rounds, "relight_two_sectors; here nothing moves", sizes),
-        row(
-            "relight_two_sectors_flicker",
-            ticks.flickering,
-            ticks.everything,
-            5 * rounds,
-            "the same, lamps steady",
-            sizes | {"lamps": LAMPS},
-        ),
-        row("relight_host", tiny.everything, ticks.everything, 5 * rounds, "relight_two_sectors; here one probe and brick", {"sectors": 2}),
+        row("relight_two_sectors", ticks.sun_moved, ticks.sun_moved_twin, rounds, "NumPy twin, float32; each tick: the sun moves", lit),
+        row("relight_two_sectors_resampled", ticks.everything, ticks.everything_twin, rounds, "NumPy twin, float32; both sample anew", lit),
+        row("relight_two_sectors_settled", ticks.settled, ticks.sun_moved, 5 * rounds, f"{all_of}; here nothing moves", sizes),
+        row("relight_two_sectors_flicker", ticks.flickering, ticks.sun_moved, 5 * rounds, f"{all_of}: lamps steady", lit),
+        row("relight_host", tiny.everything, ticks.everything, 5 * rounds, f"{all_of}_resampled; here one probe and brick", {"sectors": 2}),
     ]
 
 
