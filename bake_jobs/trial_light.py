@@ -81,7 +81,8 @@ class TrialScene:
             hits = self._rays.closest(np.repeat(some, len(direction), axis=0), np.tile(direction, (len(some), 1)))
             distance = hits.distance.reshape(len(some), -1)
             clearance[start : start + len(some)] = distance.min(axis=1)
-            reach = np.where(np.isfinite(distance), distance, 0)[:, :, None]
+            # A ray into a corner may end a rounding beyond the edge, in the next cell: keys are taken a little before the end.
+            reach = np.where(np.isfinite(distance), distance - np.float32(KEY_OFFSET_M), 0)[:, :, None]
             at = (some - anchor).astype(np.float32)[:, None] + direction * reach
             key = _cell_keys(at.reshape(-1, 3), hits, distance.reshape(-1))
             keys[start : start + len(some)] = key.reshape(len(some), -1)

@@ -145,7 +145,7 @@ def test_what_the_system_refuses_is_one_line_with_the_path(sectorlight: RunComma
 
 
 def test_a_full_disk_names_the_output(sectorlight: RunCommand, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fill(*_: object) -> None:
+    def fill(*_: object, **__: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr("bake_jobs.runner.bake", fill)
