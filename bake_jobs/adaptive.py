@@ -80,11 +80,12 @@ class Ranking:
 
     def first(self, count: int) -> tuple[Placement, Float32]:
         """The first ``count`` probes, and their trial light."""
-        kept = np.arange(min(max(count, self.fixed), len(self.position), MAX_PROBES_PER_SECTOR))
+        wanted = min(max(count, self.fixed), len(self.position))
+        kept = np.arange(min(wanted, MAX_PROBES_PER_SECTOR))
         # Stored along a curve of place, as the grid's are.
         order = kept[np.lexsort((self.position[kept, 1], self.position[kept, 0] // 8, self.position[kept, 2] // 8))]
-        dropped = max(0, self.enough - len(kept))
-        return Placement(self.position[order], self.flags[order], self.room[order], 0, dropped), self.cube[order]
+        placed = Placement(self.position[order], self.flags[order], self.room[order], 0, wanted - len(kept))
+        return placed, self.cube[order]
 
 
 def rank_probes(

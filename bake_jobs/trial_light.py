@@ -6,9 +6,9 @@ every doubling of the distance, and by principal direction, as surfels are. A ce
     M = albedo (E_sun + E_sky + E_bounced) + pi L,     E_bounced: the same one bounce on, from a few rays, later ones as a series
 
 That point is found by a ray through the middle of the cell, not among the hits; so neither which sector asks nor what else it asks about
-changes a number, and two neighbours place the same probes along their border. In a hall that is lower than a far cell is wide (4 m beyond
-8 m, 8 m beyond 16 m) the point may lie beyond the ceiling. That misplaces a probe or a weight, but leaks no light: the bake casts its own
-rays.
+changes a number, and two neighbours place the same probes along their border. The price: where a cell is larger than a closed place (4 m
+beyond 8 m, 8 m beyond 16 m), its point may lie beyond the wall or the ceiling. That misplaces a probe or a weight, but leaks no light: the
+bake casts its own rays.
 """
 
 from dataclasses import dataclass
@@ -80,7 +80,8 @@ class TrialScene:
             hits = self._rays.closest(np.repeat(some, len(direction), axis=0), np.tile(direction, (len(some), 1)))
             distance = hits.distance.reshape(len(some), -1)
             clearance[start : start + len(some)] = distance.min(axis=1)
-            reach = np.where(np.isfinite(distance), distance, 0)[:, :, None]
+            # A ray into a corner may end a rounding beyond the edge, in the next cell: keys are taken a little before the end.
+            reach = np.where(np.isfinite(distance), distance - np.float32(KEY_OFFSET_M), 0)[:, :, None]
             at = (some - anchor).astype(np.float32)[:, None] + direction * reach
             key = _cell_keys(at.reshape(-1, 3), hits, distance.reshape(-1))
             keys[start : start + len(some)] = key.reshape(len(some), -1)

@@ -293,3 +293,15 @@ def test_the_bake_id_names_scene_settings_seed_and_versions(source, monkeypatch)
     monkeypatch.setattr(runner, "BAKER_VERSION", runner.BAKER_VERSION + 1)
     others.add(runner._bake_id(scene, settings_for("draft"), 0))
     assert len(others | {first}) == 4
+
+
+def test_a_target_error_is_estimated_for_every_sector_and_misses_are_named(source, tmp_path):
+    with (tmp_path / "said").open("w") as said:
+        world = bake(str(source), tmp_path / "out", "draft", 1, ((0, 2), (0, 1)), console=Console(file=said, width=200), target_error=0.001)
+    assert world.settings["target_error"] == 0.001
+    estimates = {index: facts.estimated_error for index, facts in Dataset.open(tmp_path / "out").world.sectors.items()}
+    assert all(estimate is not None for estimate in estimates.values())
+    text = (tmp_path / "said").read_text()
+    for index, estimate in estimates.items():
+        assert (f"{index.x},{index.z} ({100 * estimate:.1f} %)" in text) == (estimate > 0.001)
+    assert "estimated error" in text

@@ -291,3 +291,14 @@ def test_an_unreadable_file_is_the_users_to_mend(tmp_path, monkeypatch):
     monkeypatch.setattr(Path, "read_bytes", denied)
     with pytest.raises(InputError, match="Permission denied"):
         Dataset.open(tmp_path)
+
+
+def test_an_estimate_of_the_error_is_kept_where_the_bake_made_one():
+    assert read(RECORD).estimated_error is None
+    record = at("sectors", "-1,0", "estimated_error", to=0.034)
+    world = read(record)
+    assert (world.sectors[SectorIndex(-1, 0)].estimated_error, world.estimated_error) == (0.034, 0.034)
+    assert json.loads(json.dumps(world.to_json())) == record
+    for wrong in (-0.1, "small", None, True):
+        with pytest.raises(CorruptFileError, match="estimated_error"):
+            read(at("sectors", "-1,0", "estimated_error", to=wrong))

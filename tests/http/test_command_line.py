@@ -117,6 +117,13 @@ def test_presets_that_come_later_are_refused_before_anything_is_read(sectorlight
     assert not (tmp_path / "out").exists()
 
 
+def test_an_impossible_target_error_is_refused(sectorlight: RunCommand, tmp_path: Path) -> None:
+    for target in ("0", "7", "nan"):
+        done = sectorlight("bake", SOURCE, "-o", str(tmp_path / "out"), "--target-error", target)
+        expect_refusal(done, "--target-error", "0.04")
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_cluster_is_not_taken_yet(sectorlight: RunCommand, tmp_path: Path) -> None:
     done = sectorlight("bake", SOURCE, "-o", str(tmp_path / "out"), "--ray", "somewhere:6379")
     assert done.returncode == 2
