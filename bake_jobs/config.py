@@ -11,6 +11,12 @@ from gi_core.sky_patches import MIN_PATCHES, SKY_SCHEMES
 
 Preset = Literal["draft", "talk", "standard"]
 PRESETS: tuple[str, ...] = get_args(Preset)
+KNOB_CHOICES: dict[str, tuple[str, ...]] = {
+    "basis": tuple(BASIS_SIZES),
+    "sky": SKY_SCHEMES,
+    "placement": ("grid", "adaptive"),
+    "voxel_weights": ("nearest", "fitted"),
+}
 # What a knob may be where it is not any length, angle or number of 0.01 to 10 000.
 KNOB_RANGES = {
     "sky_patches": (MIN_PATCHES, MAX_SKY_PATCHES),
@@ -75,8 +81,8 @@ class BakeSettings:
     voxel_probes: int = 4
     voxel_candidates: int = 8
     feedback_probes: int = 1
-    placement: Literal["grid", "adaptive"] = "grid"
-    voxel_weights: Literal["nearest", "fitted"] = "nearest"
+    placement: str = "grid"
+    voxel_weights: str = "nearest"
     trial_rays_per_face_edge: int = 8
     probe_worth: float = 0.01
     probe_budget: int = 1000
@@ -113,7 +119,7 @@ def with_knobs(settings: BakeSettings, knobs: Sequence[str]) -> BakeSettings:
             turned[name] = {str: str, int: int, float: float}[type(getattr(settings, name))](value)
         except ValueError as error:
             raise InputError(f"knob {knob[:60]!r}: expected a number") from error
-        choices = {"basis": tuple(BASIS_SIZES), "sky": SKY_SCHEMES}.get(name)
+        choices = KNOB_CHOICES.get(name)
         low, high = KNOB_RANGES.get(name, (0.01, 1e4))
         if choices is not None and value not in choices:
             raise InputError(f"knob {knob[:60]!r}: expected {' or '.join(choices)}")
@@ -149,5 +155,5 @@ def settings_for(preset: str) -> BakeSettings:
         )
     if preset == "standard":
         # One feedback probe: with probes as close together as these, more of them were no better (MATH.md, "What each idea is worth").
-        return BakeSettings(preset="standard", basis="sh2", sky="patches")
+        return BakeSettings(preset="standard", basis="sh2", sky="patches", **ADAPTIVE)
     raise InputError(f"quality {preset!r}: expected one of {', '.join(PRESETS)}")

@@ -101,8 +101,8 @@ def bake(
     output: Annotated[Path, typer.Option("--output", "-o", help="The dataset's folder.")],
     quality: Annotated[
         str,
-        typer.Option(help="Preset: talk, the 2016 method as its slides give it; standard, right for more; or draft, coarser and quicker."),
-    ] = "talk",
+        typer.Option(help="Preset: draft, the quickest; talk, the 2016 method as its slides give it; or standard, right for more."),
+    ] = "standard",
     jobs: Annotated[int, typer.Option(min=0, max=1024, help="Processes; 0 means one per core.")] = 0,
     sectors: Annotated[str | None, typer.Option(help="X0:X1,Z0:Z1, half open; sector (i, j) covers [64 i, 64 i + 64) m.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Same source, settings and seed give the same bytes.")] = 0,

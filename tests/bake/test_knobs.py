@@ -16,7 +16,8 @@ def test_a_knob_changes_one_setting_and_the_name():
 
 
 def test_standard_is_the_talk_and_its_ideas():
-    ideas = with_knobs(settings_for("talk"), ["basis=sh2", "sky=patches"]).to_json()
+    placed = ["placement=adaptive", "voxel_weights=fitted", "voxel_candidates=24", "margin_m=3.2"]
+    ideas = with_knobs(settings_for("talk"), ["basis=sh2", "sky=patches", *placed]).to_json()
     assert settings_for("standard").to_json() | {"preset": ""} == ideas | {"preset": ""}
 
 
@@ -26,6 +27,8 @@ def test_standard_is_the_talk_and_its_ideas():
         ("basis", "expected cube or sh1 or sh2"),
         ("basis=sh9", "expected cube or sh1 or sh2"),
         ("sky=none", "expected faces or patches"),
+        ("placement=random", "expected grid or adaptive"),
+        ("voxel_weights=1", "expected nearest or fitted"),
         ("sky_patches=2", "expected 4 to 1024"),
         ("feedback_probes=33", "expected 1 to 32"),
         ("feedback_probes=six", "expected a number"),
