@@ -14,7 +14,7 @@ from gi_core.errors import DeviceError, KernelBuildError
 from kernels_cl import include_directory, source
 
 ENVIRONMENT = "SECTORLIGHT_DEVICE"
-GROUP = 16  # work-items per work-group
+GROUP = 32  # work-items per work-group
 
 
 def available_devices() -> list[cl.Device]:
