@@ -4,8 +4,9 @@
     flops    additions, multiplications and comparisons of floats; a fused pair counts as two, conversions and addresses as none
     bound    the longer of bytes / STREAM's rate and flops / the FMA loop's rate
 
-Times are the device's own, from a kernel's start to its end, in the ticks of ``relight_two_sectors``. STREAM (McCalpin, "Memory bandwidth
-and machine balance", 1995) runs over as many bytes as the eight sectors of the rotation hold, so it reads from the same cache or memory.
+Times are the device's own, from a kernel's start to its end, in ticks of ``relight_two_sectors_resampled``. STREAM (McCalpin, "Memory
+bandwidth and machine balance", 1995) runs over as many bytes as the eight sectors of the rotation hold, so it reads from the same cache
+or memory.
 """
 
 from collections.abc import Callable

@@ -19,6 +19,10 @@ def loadtest(
     url: Annotated[str, typer.Argument(help="Of a running server, as in http://127.0.0.1:8000")],
     players: Annotated[int, typer.Option(min=1, max=10_000, help="Simulated players to make; a client follows each.")] = 1,
     seconds: Annotated[float, typer.Option(min=1, max=1e6, help="How long, once all players are there.")] = 30.0,
+    warm_up: Annotated[
+        float,
+        typer.Option(min=0, max=1e6, help="Seconds that players walk before anything is counted; tick percentiles are the last minute's."),
+    ] = 0.0,
     path: Annotated[
         Path | None,
         typer.Option(help="JSON: a list of points x, y, z in metres, or several such lists; without it players walk the streets."),
@@ -62,6 +66,7 @@ def loadtest(
         seed,
         None if token_file is None else read_token(token_file),
         pop_bound,
+        warm_up,
     )
     limits = Limits(max_tick_p99_ms, max_late_share, max_volume_p99_ms, max_megabits, max_misses, max_pops, max_errors)
     with writing(json_path or plot_path):

@@ -43,6 +43,7 @@ class Options:
     url : of the server, without a path
     paths : world metres; player k walks number k modulo their count; without any the server makes up a walk for each
     speed : [m/s]
+    warm_up_s : how long players walk before clients follow and anything is counted
     token : bearer token of writes
     pop_bound : relative change of a voxel between two ticks beyond which it pops
     """
@@ -56,6 +57,7 @@ class Options:
     seed: int = 0
     token: str | None = None
     pop_bound: float = 0.2
+    warm_up_s: float = 0.0
 
 
 def run(options: Options, progress: Progress) -> dict[str, Any]:
@@ -76,7 +78,12 @@ async def _run(options: Options, progress: Progress) -> dict[str, Any]:
         _interruptible(stop),
         _players(http, options) as players,
     ):
-        recorder, started = Recorder(), time.perf_counter()
+        recorder = Recorder()
+        if options.warm_up_s > 0:
+            progress(0.0, recorder)
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(stop.wait(), options.warm_up_s)
+        started = time.perf_counter()
         watch = Watch(recorder, lambda: time.perf_counter() - started, options.pop_bound)
         await _ask_live(http, watch)
         rate = recorder.last("tick_rate") or DEFAULT_TICK_RATE

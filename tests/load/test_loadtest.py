@@ -52,6 +52,15 @@ def test_a_server_that_behaves(standing_in: StandingIn, mode: str) -> None:
         assert report["frames"] > 3 * 10
 
 
+def test_a_warm_up_is_not_counted(standing_in: StandingIn) -> None:
+    with standing_in() as (_, url):
+        started = time.monotonic()
+        report = measure(url, warm_up_s=1.0)
+        assert time.monotonic() - started >= 2.7
+    assert report["seconds"] == pytest.approx(1.7, abs=0.9)
+    assert report["ticks"] == pytest.approx(30 * report["seconds"], abs=20)
+
+
 @pytest.mark.parametrize("mode", ["stream", "fetch"])
 def test_pops_are_counted(standing_in: StandingIn, mode: str) -> None:
     with standing_in(pops=True, since=0, every=2) as (_, url):
