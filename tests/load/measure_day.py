@@ -11,6 +11,7 @@ import json
 import random
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,15 +21,12 @@ from gi_core.engine import Engine
 from gi_core.errors import SectorlightError
 from gi_core.lighting_model import make_lighting
 from gi_core.spectrum import LUMINANCE_FROM_RGB
+from server.cli_serve import SWITCH_INTERVAL_S
 from server.live import Live, LiveOptions
 from server.live_weather import scripted_weather
 from server.players import Player
+from server.routes.live import memory_bytes
 from server.tick_stats import percentiles
-
-
-def resident_mb() -> float:
-    """Memory of this process that is in RAM [MB]."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 1e6
 
 
 def luminance(values: np.ndarray) -> np.ndarray:
@@ -69,16 +67,14 @@ def main() -> int:
     parser.add_argument("--checks", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
-    sys.setswitchinterval(0.0005)
+    sys.setswitchinterval(SWITCH_INTERVAL_S)  # as the server has it
     dataset = Dataset.open(options.dataset)
     live, engine = Live(dataset, LiveOptions(start_time="00:00")), Engine(dataset)
     ticker = live.ticker
     ticker.wait_until_running(120)
     script = scripted_weather(options.seed, dataset.world.location)
     walking = [live.walking(Player(f"p{i}", speed=1.4, seed=i, walk_m=500.0), 0, False) for i in range(options.players)]
-    ticker.apply(
-        lambda state, tick: state.__class__(**{**vars(state), "weather": script, "clock": state.clock.with_rate(tick, options.rate)})
-    )
+    ticker.apply(lambda state, tick: replace(state, weather=script, clock=state.clock.with_rate(tick, options.rate)))
     for player in walking:
         ticker.apply(lambda state, _, player=player: state.with_player(player)).result()
     time.sleep(5)
@@ -90,7 +86,7 @@ def main() -> int:
     while time.monotonic() - started < seconds:
         now = time.monotonic() - started
         if len(memory) <= 24 * now / seconds:
-            memory.append(round(resident_mb(), 1))
+            memory.append(round((memory_bytes() or 0) / 1e6, 1))
         if due and now >= due[0]:
             due.pop(0)
             try:
