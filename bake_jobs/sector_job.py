@@ -15,7 +15,7 @@ from bake_jobs.scene import Scene
 from bake_jobs.target_error import probes_for_target
 from bake_jobs.trial_light import TrialScene
 from bake_jobs.trial_states import trial_states
-from gi_core import geometry_file, sector_file
+from gi_core import factor_weights, geometry_file, sector_file
 from gi_core.arrays import Float32, Float64
 from gi_core.constants import ALBEDO_MAX, ROOM_OUTDOORS
 from gi_core.geometry_file import Geometry
@@ -68,6 +68,7 @@ class SectorBaker:
         surfaces = np.array([heights.min(), heights.max()])
         lattice = voxels.bake_voxels(rays, self._solids, surfaces, index, placed, settings, scene.rooms, trial)
         emits = bool(clustered.emission.any())
+        factor_code, factor_scale = factor_weights.encode(weights.weight, weights.starts, weights.source >= len(clustered.brick_cell))
         sector = Sector(
             index=index,
             probe_position=(placed.position - index.origin).astype(np.float32),
@@ -75,7 +76,8 @@ class SectorBaker:
             probe_room=placed.room,
             factor_starts=weights.starts,
             factor_source=weights.source,
-            factor_weight=weights.weight,
+            factor_code=factor_code,
+            factor_scale=factor_scale,
             brick_starts=clustered.brick_starts.astype(np.uint32),
             brick_level=clustered.brick_level,
             brick_cell=clustered.brick_cell,

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from gi_core import sector_file
+from gi_core import factor_weights, sector_file
 from gi_core.constants import BRICK_CELL_M, VOLUME_SHAPE
 from gi_core.device import Device, shared_device
 from gi_core.grid import SectorIndex
@@ -93,15 +93,19 @@ def talk_size_sector(seed: int, probes: int = TALK_PROBES, surfels: int = TALK_S
     sky = np.tile(bricks + np.arange(SKY_PATCHES), (probes, 1))
     weight = rng.uniform(0, 1, (factors, 6)) ** 4
     weight /= weight.reshape(probes, per_probe, 6).sum(axis=1).repeat(per_probe, axis=0)
+    factor_starts = starts(np.full(probes, per_probe))
+    source = np.concatenate([np.sort(near, axis=1), sky], axis=1).reshape(-1).astype(np.uint32)
+    factor_code, factor_scale = factor_weights.encode(weight, factor_starts, source >= bricks)
     shape = (16, 20, 20)
     return Sector(
         index=SectorIndex(0, 0),
         probe_position=rng.uniform(0, 64, (probes, 3)).astype(np.float32),
         probe_flags=np.ones(probes, np.uint8),
         probe_room=np.zeros(probes, np.uint16),
-        factor_starts=starts(np.full(probes, per_probe)),
-        factor_source=np.concatenate([np.sort(near, axis=1), sky], axis=1).reshape(-1).astype(np.uint32),
-        factor_weight=weight.astype(np.float32),
+        factor_starts=factor_starts,
+        factor_source=source,
+        factor_code=factor_code,
+        factor_scale=factor_scale,
         brick_starts=starts(brick_sizes),
         brick_level=np.zeros(bricks, np.uint8),
         brick_cell=cell.astype(np.int32),

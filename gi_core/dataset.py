@@ -335,7 +335,7 @@ class Dataset:
             raise CorruptFileError(
                 f"{path}: {len(sector.sun_visibility)} sun planes, expected {world.sun_table.plane_count}; bake it again"
             )
-        if sector.factor_weight.shape[1] != BASIS_SIZES[world.basis]:
+        if sector.basis_size != BASIS_SIZES[world.basis]:
             raise CorruptFileError(
                 f"{path}: {sector.basis_size} coefficients, expected {BASIS_SIZES[world.basis]} of {world.basis}; bake it again"
             )

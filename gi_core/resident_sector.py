@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 
-from gi_core import relight_twin
+from gi_core import factor_weights, relight_twin
 from gi_core.arrays import AnyArray, Float32, UInt32
 from gi_core.basis import FEEDBACK, basis_of_size, conversion
 from gi_core.constants import BASIS_SIZES
@@ -27,8 +27,8 @@ from gi_core.sector import Sector, starts
 Launch = Callable[..., None]
 
 VOXEL_GROUP = (8, 4, 1)  # work-items of fill_volume.cl along x, y, z; see SharedKernel
-# gather_probes.cl reads whole vectors, beyond the last factor's weights.
-PADDING_WEIGHTS = 8
+# gather_probes.cl reads whole vectors, beyond the last factor's codes and the last probe's scales.
+VECTOR = 8
 SURFELS_PER_GROUP = 8  # of sun_on_surfels.cl: a byte of a plane's bits
 
 
@@ -61,7 +61,9 @@ class ResidentSector:
         self.brick_emission = None if sector.surfel_emission is None else device.upload(_brick_emission(sector))
         self.factor_starts = device.upload(sector.factor_starts)
         self.factor_source = device.upload(sector.factor_source)
-        self.factor_weight = device.upload(padded_weights(sector.factor_weight))
+        self.sky_starts = device.upload(sector.sky_starts)
+        self.factor_code = device.upload(padded(factor_weights.device_code(sector.factor_code)))
+        self.factor_scale = device.upload(padded(factor_weights.device_scale(sector.factor_code, sector.factor_scale)))
         self.voxel_probe = device.upload(sector.voxel_probe)
         self.voxel_weight = device.upload(sector.voxel_weight)
         self.cubes = device.allocate(sector.probe_count * sector.basis_size * 16)
@@ -100,7 +102,7 @@ class ResidentSector:
         same shape and no memory."""
         if self.sun_visibility is None:
             self.sun_visibility = self.device.upload(self.sector.sun_visibility)
-        gone = ("factor_weight", "factor_source", "surfel_albedo", "surfel_snow", "sun_visibility", "voxel_probe", "voxel_weight")
+        gone = ("factor_code", "factor_source", "surfel_albedo", "surfel_snow", "sun_visibility", "voxel_probe", "voxel_weight")
         arrays: dict[str, AnyArray] = {name: getattr(self.sector, name) for name in gone}
         empty: dict[str, Any] = {name: np.broadcast_to(a.dtype.type(0), a.shape) for name, a in arrays.items()}
         self.sector = replace(self.sector, **empty)
@@ -260,7 +262,7 @@ class ResidentSector:
     def _gather_probes(self, cubes: cl.Buffer) -> Launch:
         sector = self.sector
         kernel = self.device.shared_kernel("gather_probes", BASIS_SIZE=sector.basis_size)
-        factors = (self.factor_starts, self.factor_source, self.factor_weight)
+        factors = (self.factor_starts, self.sky_starts, self.factor_source, self.factor_code, self.factor_scale)
         return self._launch(kernel, sector.probe_count, np.uint32(sector.probe_count), *factors, self.exitance, cubes)
 
     def _collect_bounces(self, snow: float) -> None:
@@ -307,6 +309,6 @@ def _brick_emission(sector: Sector) -> Float32:
     return np.pad(np.float32(np.pi) * means, ((0, 0), (0, 1)))
 
 
-def padded_weights(weights: Float32) -> Float32:
-    """Factor weights (F, B) in one row, and behind them zeros for the last factor's vectors to reach into."""
-    return np.concatenate([weights.reshape(-1), np.zeros(PADDING_WEIGHTS, np.float32)])
+def padded(values: AnyArray) -> AnyArray:
+    """The values in one row, and behind them zeros for the last vector to reach into."""
+    return np.concatenate([values.reshape(-1), np.zeros(VECTOR, values.dtype)])

@@ -4,7 +4,7 @@ Ragged lists are ``<x>_starts`` (one more than there are items) over flat arrays
 minus ``SectorIndex.origin``, so that a world 50 km from its origin loses nothing in float32.
 
     probe p   reads factors factor_starts[p] .. factor_starts[p + 1]
-    factor f  weighs source factor_source[f] in each of the B basis functions: factor_weight[f]
+    factor f  weighs source factor_source[f] in each of the B basis functions: factor_weight[f], which is what its code stands for
     source s  is brick s when s < bricks, otherwise sky patch s - bricks
     brick b   averages surfels brick_starts[b] .. brick_starts[b + 1]
     surfel s  is lit by sun and moon through sun_visibility, by feedback_probe[s] with feedback_weight[s], and by its emission
@@ -16,11 +16,12 @@ A sky patch's exitance is pi times its radiance.
 """
 
 from dataclasses import dataclass, fields
+from functools import cached_property
 
 import numpy as np
 
-from gi_core.arrays import AnyArray, Float32, Int32, Int64, UInt8, UInt16, UInt32
-from gi_core.basis import basis_of_size, factor_shares
+from gi_core import factor_weights
+from gi_core.arrays import AnyArray, Float16, Float32, Int8, Int32, Int64, UInt8, UInt16, UInt32
 from gi_core.constants import ALBEDO_MAX, BASIS_SIZES, MAX_BRICK_LEVEL, MAX_PROBES_PER_SECTOR, MAX_SKY_PATCHES
 from gi_core.errors import CorruptFileError
 from gi_core.grid import SectorIndex, voxel_columns
@@ -36,8 +37,9 @@ class Sector:
     probe_flags : (P,) uint8, bits PROBE_ON_GROUND, PROBE_ON_WALL, PROBE_IN_MARGIN (it lies beyond the border, so that there is no seam)
     probe_room : (P,) uint16, 0 outdoors
     factor_starts : (P + 1,) uint32
-    factor_source : (F,) uint32, < N a brick, otherwise sky patch source - N
-    factor_weight : (F, B) float32
+    factor_source : (F,) uint32, < N a brick, otherwise sky patch source - N; a probe's bricks come first
+    factor_code : (F, B) uint8, of harmonics int8 (gi_core.factor_weights)
+    factor_scale : (P, 2, B) float16: of each probe's bricks, and of its sky
     brick_starts : (N + 1,) uint32; no brick is empty
     brick_level : (N,) uint8; a brick's cell is BRICK_CELL_M * 2 ** level wide, its surfels' cells SURFEL_CELL_M * 2 ** level
     brick_cell : (N, 3) int32, which cell of that size in sector-local space
@@ -64,7 +66,8 @@ class Sector:
     probe_room: UInt16
     factor_starts: UInt32
     factor_source: UInt32
-    factor_weight: Float32
+    factor_code: UInt8 | Int8
+    factor_scale: Float16
     brick_starts: UInt32
     brick_level: UInt8
     brick_cell: Int32
@@ -101,7 +104,17 @@ class Sector:
 
     @property
     def basis_size(self) -> int:
-        return int(self.factor_weight.shape[1])
+        return int(self.factor_code.shape[1])
+
+    @cached_property
+    def sky_starts(self) -> UInt32:
+        """(P,): where each probe's sky patches begin among its factors."""
+        return factor_weights.sky_starts(self.factor_starts, self.factor_source >= self.brick_count)
+
+    @cached_property
+    def factor_weight(self) -> Float32:
+        """(F, B) float32: what the codes stand for. Kernels read the codes; this is for the twin, and for looking."""
+        return factor_weights.decode(self.factor_code, self.factor_scale, self.factor_starts, self.sky_starts)
 
     @property
     def nbytes(self) -> int:
@@ -136,7 +149,8 @@ def check_sector(sector: Sector, sky_patches: int) -> None:
 
     expect(s.probe_count <= MAX_PROBES_PER_SECTOR, f"at most {MAX_PROBES_PER_SECTOR} probes, got {s.probe_count}")
     expect(1 <= sky_patches <= MAX_SKY_PATCHES, f"1 to {MAX_SKY_PATCHES} sky patches, got {sky_patches}")
-    expect(s.factor_weight.ndim == 2 and s.basis_size in BASIS_SIZES.values(), f"factor_weight of a basis {BASIS_SIZES}")
+    expect(s.factor_code.ndim == 2 and s.basis_size in BASIS_SIZES.values(), f"factor_code of a basis {BASIS_SIZES}")
+    expect(s.factor_code.dtype == (np.uint8 if s.basis_size == BASIS_SIZES["cube"] else np.int8), "codes with a sign, but for the cube's")
     expect_starts(s.factor_starts, s.probe_count, s.factor_count, "factor_starts")
     expect_starts(s.brick_starts, s.brick_count, s.surfel_count, "brick_starts")
     expect((counts(s.brick_starts) > 0).all(), "no empty brick")
@@ -144,7 +158,8 @@ def check_sector(sector: Sector, sky_patches: int) -> None:
         (s.probe_count, "probe_position", (3,)),
         (s.probe_count, "probe_flags", ()),
         (s.probe_count, "probe_room", ()),
-        (s.factor_count, "factor_weight", (s.basis_size,)),
+        (s.factor_count, "factor_code", (s.basis_size,)),
+        (s.probe_count, "factor_scale", (2, s.basis_size)),
         (s.brick_count, "brick_cell", (3,)),
         (s.brick_count, "brick_level", ()),
         (s.surfel_count, "surfel_normal", (3,)),
@@ -178,14 +193,14 @@ def check_sector(sector: Sector, sky_patches: int) -> None:
         values = getattr(s, field.name)
         if isinstance(values, np.ndarray) and values.dtype.kind == "f":
             expect(np.isfinite(values).all(), f"finite {field.name}")
-    # Float32 may round 0.95 and sums up by 6e-8.
-    basis = basis_of_size(s.basis_size)
-    lowest = 0 if basis == "cube" else -1 - 1e-6
-    share = s.factor_weight if basis == "cube" else s.factor_weight * factor_shares(basis).astype(np.float32)
-    expect((share >= lowest).all() and (share <= 1 + 1e-6).all(), f"shares of factor_weight within {lowest:.0f}..1")
+    expect((s.factor_scale >= 0).all() and (s.factor_scale <= 1).all(), "factor_scale within 0..1")
+    # Float32 may round 0.95 up by 6e-8.
     expect((s.surfel_albedo >= 0).all() and (s.surfel_albedo <= ALBEDO_MAX + 1e-6).all(), f"surfel_albedo within 0..{ALBEDO_MAX}")
     if s.factor_count:
-        totals = np.add.reduceat(share, s.factor_starts[:-1][counts(s.factor_starts) > 0], dtype=np.float64)
-        # Float32 sums of rounded weights; 1 % leaves each bounce losing 4 % even where every albedo is at its bound.
+        is_sky, starts_sky = s.factor_source >= s.brick_count, np.zeros(s.factor_count + 1, bool)
+        starts_sky[s.factor_starts] = True
+        expect((is_sky[1:] | ~is_sky[:-1] | starts_sky[1:-1]).all(), "each probe's bricks before its sky patches")
+        totals = factor_weights.share_sums(s.factor_code, s.factor_scale, s.factor_starts, s.sky_starts)
+        # Rounded weights; 1 % leaves each bounce losing 4 % even where every albedo is at its bound.
         expect((totals <= 1.01).all(), f"a probe's factor weights to sum to at most 1 in each basis function, got {totals.max():.3f}")
     expect(s.surfel_emission is None or (s.surfel_emission >= 0).all(), "no negative surfel_emission")

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from gi_core import container, quantise
-from gi_core.arrays import AnyArray, Float32
-from gi_core.basis import basis_of_size, factor_shares
+from gi_core.arrays import AnyArray
 from gi_core.constants import ALBEDO_MAX, BASIS_SIZES, BRICK_CELL_M, MAX_BRICK_LEVEL
 from gi_core.container import Container
 from gi_core.errors import CorruptFileError
@@ -22,20 +21,20 @@ NO_PROBE = 0xFFFF
 MAX_BLENDED_PROBES = 32
 # A brick's cell is divided into 256 steps: 1.6 cm of 4 m.
 _CELL_STEPS = 256
-# Codes of harmonics' weights are multiples of these, by band: an eighth less of a file, for 0.2 % of a probe's light (MATH.md).
-_BAND_STEPS = np.repeat([1, 3, 4], [1, 3, 5])
-# One step brings a sum to within the smallest step that a weight of it can take.
-_BALANCING_STEPS = 3
 _META = frozenset({"sector", "sky_patches", "voxel_first", "bake"})
 # Fields that are stored under another name: starts as counts, positions within their brick's cell.
-_RENAMED = {"factor_starts": "factor_count", "brick_starts": "brick_count", "surfel_position": "surfel_in_cell"}
-_ARRAYS = frozenset(_RENAMED.get(f.name, f.name) for f in fields(Sector)) - {"index", "voxel_first"} | {"factor_scale"}
+_RENAMED = {
+    "factor_starts": "factor_count",
+    "factor_code": "factor_weight",
+    "brick_starts": "brick_count",
+    "surfel_position": "surfel_in_cell",
+}
+_ARRAYS = frozenset(_RENAMED.get(f.name, f.name) for f in fields(Sector)) - {"index", "voxel_first"}
 
 
 def encode(sector: Sector, meta: dict[str, Any], sky_patches: int) -> bytes:
     """Bytes of a sector file. ``meta`` is any JSON object: the baker's fingerprint, counts and report."""
     s = sector
-    weight_codes, weight_scales = _encode_weights(s)
     cell, size = _surfel_cells(s.brick_cell, s.brick_level, s.brick_starts)
     in_cell = np.floor((s.surfel_position / size - cell) * _CELL_STEPS)
     feedback = np.where(s.feedback_weight > 0, s.feedback_probe, NO_PROBE).astype(np.uint16)
@@ -45,8 +44,8 @@ def encode(sector: Sector, meta: dict[str, Any], sky_patches: int) -> bytes:
         "probe_room": quantise.smallest_unsigned(s.probe_room),
         "factor_count": counts(s.factor_starts).astype(np.uint16),
         "factor_source": s.factor_source.astype(np.uint32),
-        "factor_weight": weight_codes,
-        "factor_scale": weight_scales,
+        "factor_weight": s.factor_code.T,
+        "factor_scale": np.moveaxis(s.factor_scale, 0, 2),
         "brick_count": counts(s.brick_starts).astype(np.uint16),
         "brick_level": s.brick_level,
         "brick_cell": s.brick_cell.T.astype(np.int32),
@@ -108,82 +107,6 @@ def _surfel_cells(brick_cell: AnyArray, brick_level: AnyArray, brick_starts: Any
     return brick_cell[of_surfel], BRICK_CELL_M * 2.0 ** brick_level[of_surfel, None]
 
 
-def _is_sky(s: Sector) -> AnyArray:
-    return s.factor_source >= s.brick_count
-
-
-def _probe_of_factor(factor_starts: AnyArray) -> AnyArray:
-    return np.repeat(np.arange(len(factor_starts) - 1), counts(factor_starts))
-
-
-def _encode_weights(s: Sector) -> tuple[AnyArray, AnyArray]:
-    """Factor weights as (B, F) codes of their square root, and float16 (2, B, P) scales for bricks and sky.
-
-    The cube's are uint8; spherical harmonics have a sign, and int8, and are stored as shares (basis.factor_shares).
-
-    A scale is chosen so that each probe's weights (their magnitudes) still sum to what they did: rounding moves light between a
-    probe's bricks, but neither makes nor loses any.
-    """
-    basis, probes = s.basis_size, s.probe_count
-    row = _is_sky(s) * probes + _probe_of_factor(s.factor_starts)  # bricks first, then sky
-    signed = basis != BASIS_SIZES["cube"]
-    share = factor_shares(basis_of_size(basis))
-    codes = np.zeros((basis, s.factor_count), np.int8 if signed else np.uint8)
-    scales = np.zeros((2, basis, probes), np.float16)
-    for b in range(basis):
-        weight = s.factor_weight[:, b].astype(np.float64) * share[b]
-        top = np.zeros(2 * probes)
-        np.maximum.at(top, row, np.abs(weight))
-        relative = weight / np.maximum(top[row], 1e-30)
-        codes[b] = quantise.encode_signed_root(relative, int(_BAND_STEPS[b])) if signed else quantise.encode_root(relative)
-        kept = np.bincount(row, np.abs(_decode_root(codes[b]).astype(np.float64)), 2 * probes)
-        total = np.bincount(row, np.abs(weight), 2 * probes)
-        scales[:, b] = quantise.half_below(total / np.maximum(kept, 1e-30)).reshape(2, probes)
-        if b and signed:
-            codes[b] = _balanced(codes[b], weight, scales[:, b].reshape(-1), row, int(_BAND_STEPS[b]))
-    return codes, scales
-
-
-def _balanced(codes: AnyArray, weight: AnyArray, scale: AnyArray, row: AnyArray, step: int) -> AnyArray:
-    """Codes (F,) of one harmonic of which some are a step higher or lower, so that the weights of each row sum to what they did.
-
-    Light that is alike from everywhere has no direction, and rounding must not give it one: in a row the harmonic's signs cancel.
-    """
-    adjusted = codes.astype(np.int64)
-    for _ in range(_BALANCING_STEPS):
-        stored = _decode_root(adjusted.astype(np.int8)).astype(np.float64) * scale[row]
-        lacks = np.bincount(row, weight - stored, len(scale))
-        moved = np.clip(adjusted + step * np.sign(lacks[row]).astype(np.int64), -(127 // step * step), 127 // step * step)
-        change = _decode_root(moved.astype(np.int8)).astype(np.float64) * scale[row] - stored
-        left = np.abs(lacks[row] - change)
-        best = np.abs(lacks)
-        np.minimum.at(best, row, left)
-        candidates = np.flatnonzero((left == best[row]) & (left < np.abs(lacks[row])))
-        _, first = np.unique(row[candidates], return_index=True)
-        adjusted[candidates[first]] = moved[candidates[first]]
-    return adjusted.astype(np.int8)
-
-
-def _decode_root(codes: AnyArray) -> Float32:
-    return quantise.decode_signed_root(codes) if codes.dtype == np.int8 else quantise.decode_root(codes)
-
-
-def _decode_weights(codes: AnyArray, scales: AnyArray, factor_starts: AnyArray, is_sky: AnyArray) -> Float32:
-    if not np.isfinite(scales).all():
-        raise CorruptFileError("factor_scale is not finite")
-    signed = codes.dtype == np.int8
-    # Most factors are of bricks: their scales are repeated row by row, a fifth of the time that indexing each takes, and the sky's put in.
-    by_probe = np.ascontiguousarray(scales.astype(np.float32).transpose(0, 2, 1))
-    scale = np.repeat(by_probe[0], counts(factor_starts), axis=0)
-    sky = np.flatnonzero(is_sky)
-    scale[sky] = by_probe[1][np.searchsorted(factor_starts, sky, side="right") - 1]
-    weights = _decode_root(np.ascontiguousarray(codes.T))
-    weights *= scale
-    if signed:
-        weights /= factor_shares(basis_of_size(len(codes))).astype(np.float32)
-    return weights
-
-
 def _sector(found: Container) -> Sector:
     take = found.take
     found.refuse_unknown(_META, _ARRAYS)
@@ -220,7 +143,8 @@ def _sector(found: Container) -> Sector:
         probe_room=_unsigned(found, "probe_room").astype(np.uint16),
         factor_starts=factor_starts,
         factor_source=source,
-        factor_weight=_decode_weights(_weight_codes(found), take("factor_scale", "f2", 3), factor_starts, source >= len(brick_cell)),
+        factor_code=np.ascontiguousarray(_weight_codes(found).T),
+        factor_scale=np.ascontiguousarray(np.moveaxis(take("factor_scale", "f2", 3), 2, 0)),
         brick_starts=brick_starts,
         brick_level=brick_level,
         brick_cell=brick_cell,

@@ -12,6 +12,7 @@ from bake_jobs.geometry_clip import SectorCutter
 from bake_jobs.scene import Scene
 from bake_jobs.sector_job import SectorBaker
 from bake_jobs.solids import boxes
+from gi_core import factor_weights
 from gi_core.basis import basis_of_size, factor_shares
 from gi_core.grid import SectorIndex
 from gi_core.sector import Sector, starts
@@ -53,15 +54,17 @@ def random_sector(
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     per_probe = rng.integers(0, 30, probes)
     factors = int(per_probe.sum())
-    source = rng.integers(0, len(bricks) + patches, factors).astype(np.uint32)
-    weight = rng.uniform(0, 1, (factors, basis)) ** 4
     probe_of_factor = np.repeat(np.arange(probes), per_probe)
+    source = rng.integers(0, len(bricks) + patches, factors).astype(np.uint32)
+    source = source[np.lexsort((source, probe_of_factor))]
+    weight = rng.uniform(0, 1, (factors, basis)) ** 4
     for face in range(basis):
         total = np.bincount(probe_of_factor, weight[:, face], probes)
         weight[:, face] /= np.maximum(total, 1)[probe_of_factor]
     if basis != 6:
         weight *= rng.choice([-1, 1], weight.shape)
         weight /= factor_shares(basis_of_size(basis))
+    factor_code, factor_scale = factor_weights.encode(weight, starts(per_probe), source >= len(bricks))
     shape = (4, 20, 20)
     voxel_weight = rng.uniform(0, 1, (*shape, voxel_probes))
     feedback_weight = rng.uniform(0.1, 1, (surfels, feedback))
@@ -72,7 +75,8 @@ def random_sector(
         probe_room=rng.integers(0, 3, probes).astype(np.uint16),
         factor_starts=starts(per_probe),
         factor_source=source,
-        factor_weight=weight.astype(np.float32),
+        factor_code=factor_code,
+        factor_scale=factor_scale,
         brick_starts=starts(np.array(bricks, np.int64)),
         brick_level=brick_level,
         brick_cell=brick_cell,

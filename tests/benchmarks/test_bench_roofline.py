@@ -36,7 +36,15 @@ def test_what_must_move_is_what_the_buffers_hold() -> None:
     bounced = [resident.bounces, resident.bounce_starts, resident.direct, resident.exitance, resident.cubes]
     # Starts have one entry more than there are bricks or probes, weights some padding behind them.
     assert needs["bounce_bricks"][0] == pytest.approx(sum(buffer.size for buffer in bounced), abs=128)
-    gathered = [resident.factor_starts, resident.factor_source, resident.factor_weight, resident.exitance, resident.cubes]
+    gathered = [
+        resident.factor_starts,
+        resident.factor_source,
+        resident.sky_starts,
+        resident.factor_code,
+        resident.factor_scale,
+        resident.exitance,
+        resident.cubes,
+    ]
     assert needs["gather_probes"][0] == pytest.approx(sum(buffer.size for buffer in gathered), abs=128)
     samples = SunSamples(device, resident)
     sampled = samples.nbytes + samples.sun_sample.size + samples.sampled_in.size + resident.surfel_normal.size

@@ -13,11 +13,6 @@ from gi_core.sector_file import KIND, VERSION
 PATCHES = 6
 
 
-def face_sums(sector):
-    probe = np.repeat(np.arange(sector.probe_count), counts(sector.factor_starts))
-    return np.stack([np.bincount(probe, sector.factor_weight[:, b], sector.probe_count) for b in range(6)], axis=1)
-
-
 @pytest.mark.parametrize(
     "shape",
     [
@@ -37,7 +32,17 @@ def test_a_sector_survives_its_file(make_sector, shape):
     found, meta = sector_file.decode(sector_file.encode(sector, {"bake_id": "x"}, PATCHES), "here")
     assert meta == {"bake_id": "x"}
     assert found.index == sector.index
-    for name in ("factor_starts", "factor_source", "brick_starts", "brick_level", "brick_cell", "brick_direction", "sun_visibility"):
+    for name in (
+        "factor_starts",
+        "factor_source",
+        "factor_code",
+        "factor_scale",
+        "brick_starts",
+        "brick_level",
+        "brick_cell",
+        "brick_direction",
+        "sun_visibility",
+    ):
         np.testing.assert_array_equal(getattr(found, name), getattr(sector, name))
     for name in ("voxel_class", "voxel_room", "voxel_first", "probe_flags", "probe_room", "feedback_probe", "voxel_probe"):
         np.testing.assert_array_equal(getattr(found, name), getattr(sector, name))
@@ -56,46 +61,23 @@ def test_a_sector_survives_its_file(make_sector, shape):
         assert found.surfel_emission is None
 
 
-def test_a_probe_neither_gains_nor_loses_light_in_the_file(make_sector):
-    sector = make_sector(2)
-    before, after = face_sums(sector), face_sums(sector_file.quantised(sector, PATCHES))
-    assert (after <= before + 1e-6).all()
-    # float16 scales are rounded down, by one part in 1024 at most; float32 sums add 1e-6.
-    np.testing.assert_allclose(after, before, rtol=1 / 1024 + 2e-6)
-
-
-def test_writing_what_was_read_gives_the_same_arrays_but_for_scales(make_sector):
+def test_writing_what_was_read_gives_the_same_arrays(make_sector):
     once = sector_file.quantised(make_sector(3), PATCHES)
     twice = sector_file.quantised(once, PATCHES)
-    assert (np.abs(once.factor_weight - twice.factor_weight) <= once.factor_weight / 500 + 1e-7).all()
+    np.testing.assert_array_equal(once.factor_code, twice.factor_code)
     np.testing.assert_array_equal(once.surfel_position, twice.surfel_position)
     np.testing.assert_array_equal(once.surfel_normal, twice.surfel_normal)
     np.testing.assert_array_equal(once.surfel_albedo, twice.surfel_albedo)
 
 
-@pytest.mark.parametrize("basis", [4, 9])
+@pytest.mark.parametrize("basis", [4, 6, 9])
 @pytest.mark.parametrize("patches", [1, 145, 1024])
-def test_the_file_holds_harmonics_and_any_dome_of_patches(make_sector, basis, patches):
+def test_the_file_holds_any_basis_and_any_dome_of_patches(make_sector, basis, patches):
     sector = make_sector(13, basis=basis, patches=patches)
     found = sector_file.quantised(sector, patches)
-    np.testing.assert_array_equal(np.sign(found.factor_weight[:, 0]) * np.sign(sector.factor_weight[:, 0]) >= 0, True)
-    probe = np.repeat(np.arange(sector.probe_count), counts(sector.factor_starts))
-    row = 2 * probe + (sector.factor_source >= sector.brick_count)
-    rows = 2 * sector.probe_count
-    for b in range(basis):
-        top = np.zeros(rows)
-        np.maximum.at(top, row, np.abs(sector.factor_weight[:, b]))
-        off = found.factor_weight[:, b].astype(np.float64) - sector.factor_weight[:, b]
-        # Half a step of 1/127 in the square root is at most 1/127 of the largest weight, and the scale moves by as much again. The
-        # first band has a third of the steps, the second a quarter; a code or three of each probe are moved by up to three steps.
-        step = 1 if b == 0 else 3 if b < 4 else 4
-        bound = 2 * step * top / 127 + 1e-6
-        assert (np.abs(off) <= (1 if b == 0 else 4) * bound[row]).all()
-        assert (np.abs(off) > bound[row]).sum() <= 3 * rows
-        if b:  # so that no direction comes from rounding
-            sums = np.abs(np.bincount(row, off, rows))
-            assert np.median(sums[top > 0] / top[top > 0]) < 0.01
-            assert (sums <= bound).all()
+    np.testing.assert_array_equal(found.factor_code, sector.factor_code)
+    np.testing.assert_array_equal(found.factor_scale, sector.factor_scale)
+    np.testing.assert_array_equal(found.factor_weight, sector.factor_weight)
 
 
 @pytest.mark.parametrize("patches", [0, 1025])
@@ -118,6 +100,9 @@ def test_an_impossible_dome_is_refused(make_sector, patches):
         ("factor_scale", lambda a: np.full_like(a, np.inf)),
         ("factor_scale", lambda a: np.full_like(a, np.nan)),
         ("factor_scale", lambda a: -a - 1),
+        ("factor_scale", lambda a: a + 1),
+        ("factor_weight", lambda a: np.full_like(a, 255)),
+        ("factor_source", lambda a: a[::-1]),
         ("voxel_class", lambda a: np.full_like(a, 3)),
         ("voxel_class", lambda a: a[:1]),
         ("sun_visibility", lambda a: a[:, :-1]),

@@ -133,7 +133,7 @@ def test_convergence_reaches_the_float64_solve(device, make_sector, seed):
     # Random harmonics are no light and may grow: weak ones are what a real sector has.
     sector = make_sector(seed, emits=seed % 2 == 1, basis=6 if seed < 6 else 9, feedback=1 if seed < 6 else 3)
     if seed >= 6:
-        sector = replace(sector, factor_weight=sector.factor_weight * np.float32(0.3))
+        sector = replace(sector, factor_scale=sector.factor_scale * np.float16(0.3))
     given = given_light(seed, seed % 3)
     found = Relighter(device).converge(ResidentSector(device, sector, PATCHES), given)
     truth = relight_twin.solve(sector, given)

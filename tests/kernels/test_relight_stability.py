@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from gi_core import factor_weights
 from gi_core.device import shared_device
 from gi_core.layout import DIRECTIONAL_LIGHT
 from gi_core.relight import Relighter
@@ -27,7 +28,9 @@ def closed_white_room(make_sector, seed: int):
     """Every probe sees surfels only, and each reflects all that a surface may: the loop loses no more than it must."""
     sector = make_sector(seed)
     bricks_only = np.where(sector.factor_source >= sector.brick_count, 0, sector.factor_source).astype(np.uint32)
-    return replace(sector, factor_source=bricks_only, surfel_albedo=np.full_like(sector.surfel_albedo, 0.95))
+    code, scale = factor_weights.encode(sector.factor_weight, sector.factor_starts, np.zeros(sector.factor_count, bool))
+    white = np.full_like(sector.surfel_albedo, 0.95)
+    return replace(sector, factor_source=bricks_only, factor_code=code, factor_scale=scale, surfel_albedo=white)
 
 
 def run(resident: ResidentSector, given: RelightInput, ticks: int) -> np.ndarray:
