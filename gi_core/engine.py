@@ -25,6 +25,7 @@ from gi_core.resident_sector import ResidentSector
 from gi_core.sector import PROBE_IN_MARGIN
 from gi_core.settings import NEUTRAL, Settings
 from gi_core.sky_patches import face_exitance
+from gi_core.user_sky import UserSky, lighting_with_sky
 from gi_core.volume import SectorBox, Volume, box_mask, box_record, box_slices, nearest_columns, plan_boxes
 from gi_core.world import Lamp
 
@@ -74,9 +75,10 @@ class _Light:
 class Engine:
     """Lights sectors of one dataset on one device. Safe to call from several threads; the device is used by one at a time."""
 
-    def __init__(self, dataset: Dataset, device: str | None = None) -> None:
-        """``device`` is part of an OpenCL device's description. Raises DeviceError."""
+    def __init__(self, dataset: Dataset, device: str | None = None, sky: UserSky | None = None) -> None:
+        """``device`` is part of an OpenCL device's description; ``sky`` takes the place of the model's. Raises DeviceError."""
         self.dataset = dataset
+        self.sky = sky
         self.failed_sectors: dict[SectorIndex, str] = {}
         self.lamps: tuple[Lamp, ...] = dataset.world.lamps
         """Lamps of the world, each on by its schedule. Assign another tuple to move, add or remove some: nothing is baked again."""
@@ -95,7 +97,8 @@ class Engine:
 
     def lighting(self, time: str, weather: str) -> Lighting:
         """Sun, moon and sky at the dataset's place. Raises UnknownTimeError, UnknownWeatherError."""
-        return make_lighting(self.dataset.world.location, time, weather)
+        lighting = make_lighting(self.dataset.world.location, time, weather)
+        return lighting if self.sky is None else lighting_with_sky(lighting, self.sky)
 
     def lit_sector(self, index: SectorIndex, lighting: Lighting, settings: Settings = NEUTRAL) -> Float32:
         """The light of a sector's probes (P, B, 3) float32 [lx], in the dataset's basis, bounces converged to relight.QUERY_RESIDUAL.

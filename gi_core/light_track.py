@@ -13,6 +13,7 @@ from datetime import UTC, datetime, timedelta
 from gi_core.light_blend import between_lightings
 from gi_core.lighting import Lighting
 from gi_core.lighting_model import make_lighting
+from gi_core.user_sky import UserSky, lighting_with_sky
 from gi_core.weather import Weather
 from gi_core.world import Location
 
@@ -31,8 +32,10 @@ WeatherAt = Callable[[datetime], Weather]
 class LightTrack:
     """The light at the moments that a clock shows, in any order. One thread asks; ``worker`` makes what it will ask for next."""
 
-    def __init__(self, location: Location, worker: Executor) -> None:
+    def __init__(self, location: Location, worker: Executor, sky: UserSky | None = None) -> None:
+        """``sky`` takes the place of the model's."""
         self._location = location
+        self._sky = sky
         self._worker = worker
         self._weather_at: WeatherAt | None = None
         self._step_s = SHORTEST_STEP_S
@@ -55,7 +58,7 @@ class LightTrack:
         assert self._weather_at is not None
         if rate == 0:
             if self._standing is None or self._standing[0] != moment:
-                self._standing = moment, make_lighting(self._location, moment, self._weather_at(moment))
+                self._standing = moment, self._lighting(moment, self._weather_at)
             return self._standing[1]
         self._standing = None
         step_s = max(SHORTEST_STEP_S, 2.0 ** math.ceil(math.log2(max(rate * STEP_REAL_S, 1.0))))
@@ -78,4 +81,8 @@ class LightTrack:
 
     def _make(self, number: int, step_s: float, weather_at: WeatherAt) -> Lighting:
         moment = _EPOCH + timedelta(seconds=number * step_s)
-        return make_lighting(self._location, moment, weather_at(moment))
+        return self._lighting(moment, weather_at)
+
+    def _lighting(self, moment: datetime, weather_at: WeatherAt) -> Lighting:
+        lighting = make_lighting(self._location, moment, weather_at(moment))
+        return lighting if self._sky is None else lighting_with_sky(lighting, self._sky)

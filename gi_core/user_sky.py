@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -26,11 +27,13 @@ class UserSky:
     radiance : (64, 128, 3) float32 [cd m^-2 per channel], as in Lighting; zero below the horizon, where the ground is geometry
     illuminance_lx : of open level ground
     below_horizon : share 0..1 of the picture's light (luminance times solid angle) that lay below the horizon and was left out
+    holds_sun : whether the picture holds the sun itself; the model's sun and moon then give nothing
     """
 
     radiance: Float32
     illuminance_lx: float
     below_horizon: float
+    holds_sun: bool = False
 
 
 def user_sky(
@@ -83,15 +86,16 @@ def sky_of_image(
     return UserSky(radiance, found * scale, float(light[ROWS:].sum() / light.sum()))
 
 
-def lighting_with_sky(lighting: Lighting, sky: UserSky, keep_sun: bool = True) -> Lighting:
+@lru_cache(maxsize=256)
+def lighting_with_sky(lighting: Lighting, sky: UserSky) -> Lighting:
     """The same moment under another sky; time, weather, snow and fog stay.
 
-    keep_sun : False where the picture holds the sun itself: the model's sun and moon then give nothing
+    The last few hundred results are kept, by which objects they are of: ``make_lighting`` gives the same for the same moment.
     """
     served = sky.radiance[:ROWS].astype(np.float64)
     cube = cube_of_sky(served)
     cube.flags.writeable = False
-    sun, moon = (light if keep_sun else DirectionalLight(light.direction, np.zeros(3)) for light in (lighting.sun, lighting.moon))
+    sun, moon = (DirectionalLight(light.direction, np.zeros(3)) if sky.holds_sun else light for light in (lighting.sun, lighting.moon))
     beams = sum((light.irradiance * max(float(light.direction[1]), 0.0) for light in (sun, moon)), np.zeros(3))
     exposure = exposure_value(horizontal_illuminance(served) + beams)
     return replace(lighting, sun=sun, moon=moon, sky_radiance=sky.radiance, sky_cube=cube, exposure=exposure)

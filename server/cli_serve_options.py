@@ -29,6 +29,22 @@ def serve(
     epw: Annotated[
         Path | None, typer.Option(envvar="SECTORLIGHT_EPW", metavar="FILE", help="A measured year's weather, for PUT /v1/weather.")
     ] = None,
+    sky: Annotated[
+        Path | None,
+        typer.Option(
+            envvar="SECTORLIGHT_SKY", metavar="FILE", help="A sky of your own for every hour: .hdr, or .exr with the extra `sky`."
+        ),
+    ] = None,
+    sky_lux: Annotated[
+        float | None, typer.Option(envvar="SECTORLIGHT_SKY_LUX", help="What that sky gives open ground; without: its numbers are cd/m2.")
+    ] = None,
+    sky_azimuth: Annotated[
+        float, typer.Option(envvar="SECTORLIGHT_SKY_AZIMUTH", help="Compass azimuth in degrees that the picture's middle looks to.")
+    ] = 0.0,
+    sky_holds_sun: Annotated[
+        bool,
+        typer.Option("--sky-holds-sun", envvar="SECTORLIGHT_SKY_HOLDS_SUN", help="The sun is in the picture: the model's is left out."),
+    ] = False,
     tick_rate: Annotated[
         int, typer.Option(envvar="SECTORLIGHT_TICK_RATE", min=1, max=240, help="Of the live world, in Hz: more is smoother and costs more.")
     ] = 30,
@@ -46,7 +62,7 @@ def serve(
     """Serve a dataset over HTTP: its light at any hour and weather, and a live world with a clock, lights and players."""
     from server.cli_serve import run
     from server.live import LiveOptions
-    from server.settings import Settings
+    from server.settings import Settings, SkyFile
 
     live = LiveOptions(
         ticks_per_second=tick_rate,
@@ -57,4 +73,7 @@ def serve(
         state_file=state,
         epw_file=epw,
     )
-    run(dataset, Settings(host=host, port=port, device=device, token_file=token_file, live=live))
+    if sky is None and (sky_lux is not None or sky_azimuth or sky_holds_sun):
+        raise typer.BadParameter("expected --sky FILE beside --sky-lux, --sky-azimuth and --sky-holds-sun")
+    own_sky = None if sky is None else SkyFile(sky, sky_azimuth, sky_lux, sky_holds_sun)
+    run(dataset, Settings(host=host, port=port, device=device, token_file=token_file, sky=own_sky, live=live))

@@ -13,6 +13,7 @@ from types import MappingProxyType
 from gi_core.dataset import Dataset
 from gi_core.epw_weather import EpwWeather
 from gi_core.live_world import DEFAULT_BUDGET_BYTES, LiveWorld
+from gi_core.user_sky import UserSky
 from server.kept_edits import KeptEdits, load_kept
 from server.live_state import LivePlayer, LiveState, LiveUnavailableError, NotKeptError, authored_lamps
 from server.live_weather import fixed_weather
@@ -34,6 +35,7 @@ class LiveOptions:
     ticks_per_second : of real time; start_time, start_weather : as queries take them
     budget_bytes : of resident sectors on the device; places : sectors relit in a tick
     players_file : who walks from the start; state_file : where edits that ask to be kept are kept; epw_file : a measured year's weather
+    sky : in place of the model's
     """
 
     device: str | None = None
@@ -45,6 +47,7 @@ class LiveOptions:
     players_file: Path | None = None
     state_file: Path | None = None
     epw_file: Path | None = None
+    sky: UserSky | None = None
 
 
 class Live:
@@ -83,7 +86,7 @@ class Live:
             if self._ticker is None:
                 options = self.options
                 world = LiveWorld(self.dataset, options.device, budget_bytes=options.budget_bytes, places=options.places)
-                self._ticker = Ticker(world, self._state)
+                self._ticker = Ticker(world, self._state, options.sky)
                 self._ticker.start()
             return self._ticker
 

@@ -35,7 +35,7 @@ class Service:
         self.engine = engine
         self.settings = settings
         self.token = None if settings.token_file is None else read_token(settings.token_file)
-        self.live = Live(dataset, replace(settings.live, device=settings.device))
+        self.live = Live(dataset, replace(settings.live, device=settings.device, sky=engine.sky))
         self.run_id = secrets.token_hex(8)
         self.ticks = TickSignal()
         self.streams = PlayerStreams(self.ticks)
@@ -51,7 +51,8 @@ class Service:
     def open(cls, dataset_path: Path, settings: Settings) -> "Service":
         """Open a dataset and a device; InputError, FormatError or KernelBuildError when either cannot be used."""
         dataset = Dataset.open(dataset_path)
-        return cls(dataset, Engine(dataset, settings.device), settings)
+        sky = None if settings.sky is None else settings.sky.read(dataset.world.location)
+        return cls(dataset, Engine(dataset, settings.device, sky), settings)
 
     def close(self) -> None:
         """Stop the threads that encode."""

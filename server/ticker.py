@@ -26,6 +26,7 @@ from gi_core.live_sector import LiveLight
 from gi_core.live_world import LiveWorld, TickPlayers, TickReport
 from gi_core.relight_input import relight_input
 from gi_core.settings import Settings
+from gi_core.user_sky import UserSky
 from gi_core.world import Lamp
 from server.live_state import Command, LivePlayer, LiveState, LiveUnavailableError
 from server.tick_stats import TickStats
@@ -41,7 +42,8 @@ Listener = Callable[[TickReport], None]
 class Ticker:
     """Runs a live world. Commands may come from any thread; ``state`` and ``stats`` may be read by any."""
 
-    def __init__(self, world: LiveWorld, state: LiveState) -> None:
+    def __init__(self, world: LiveWorld, state: LiveState, sky: UserSky | None = None) -> None:
+        """``sky`` takes the place of the model's."""
         self.world = world
         self.state = state
         self.stats = TickStats()
@@ -54,7 +56,7 @@ class Ticker:
         self._commands: queue.SimpleQueue[tuple[Command, Future[int]]] = queue.SimpleQueue()
         self._stop = threading.Event()
         self._worker: Executor = ThreadPoolExecutor(1, thread_name_prefix="lighting")
-        self._track = LightTrack(world.dataset.world.location, self._worker)
+        self._track = LightTrack(world.dataset.world.location, self._worker, sky)
         self._track.set_weather(state.weather.at)
         self._light: LiveLight | None = None
         self._light_of: tuple[object, ...] = ()

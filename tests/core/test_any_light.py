@@ -2,6 +2,7 @@
 
 import calendar
 import math
+from dataclasses import replace
 from datetime import UTC, date, datetime, timedelta
 
 import numpy as np
@@ -214,7 +215,7 @@ finite_pixels = arrays(np.float32, (4, 8, 3), elements=st.floats(-(2.0**126), 2.
 )  # fmt: skip
 @settings(max_examples=80, deadline=None)
 def test_no_picture_of_a_sky_makes_a_number_that_is_none(
-    image: np.ndarray, north: float, centre: float, lux: float | None, keep_sun: bool
+    image: np.ndarray, north: float, centre: float, lux: float | None, holds_sun: bool
 ) -> None:
     try:
         sky = sky_of_image(image, north, centre, lux)
@@ -222,7 +223,7 @@ def test_no_picture_of_a_sky_makes_a_number_that_is_none(
         return
     assert 0 < sky.illuminance_lx <= 1.001e7
     assert 0 <= sky.below_horizon <= 1
-    light = lighting_with_sky(make_lighting(Location(), "12:00"), sky, keep_sun)
+    light = lighting_with_sky(make_lighting(Location(), "12:00"), replace(sky, holds_sun=holds_sun))
     for array in (light.sky_radiance, light.sky_cube):
         assert np.isfinite(array).all()
         assert (array >= 0).all()

@@ -3,6 +3,7 @@
 import builtins
 import contextlib
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -97,7 +98,7 @@ def test_the_models_own_sky_comes_back_unchanged() -> None:
 def test_a_picture_with_its_own_sun_turns_the_models_off() -> None:
     light = make_lighting(Location(), "12:00")
     sky = sky_of_image(uniform(8, 100.0), 0.0, 0.0, None)
-    dark = lighting_with_sky(light, sky, keep_sun=False)
+    dark = lighting_with_sky(light, replace(sky, holds_sun=True))
     assert not dark.directional_lights
     assert dark.exposure < lighting_with_sky(light, sky).exposure
     assert dark.digest not in (light.digest, lighting_with_sky(light, sky).digest)
