@@ -13,7 +13,6 @@ from gi_core.arrays import AnyArray, Float32, Float64, Int64, UInt8, UInt32
 from gi_core.basis import basis_of_size, factor_shares
 from gi_core.constants import BASIS_SIZES
 
-BRICKS, SKY = 0, 1
 # Codes of harmonics' weights are multiples of these, by band: an eighth less of a file, for 0.2 % of a probe's light (MATH.md).
 _BAND_STEPS = np.repeat([1, 3, 4], [1, 3, 5])
 # One step brings a sum to within the smallest step that a weight of it can take.
@@ -63,14 +62,14 @@ def device_scale(code: AnyArray, scale: AnyArray) -> Float32:
 
 
 def share_sums(code: AnyArray, scale: AnyArray, factor_starts: AnyArray, sky_starts: AnyArray) -> Float64:
-    """(P, B): each probe's shares summed, which must not exceed one."""
-    root = np.arange(256, dtype=np.uint8).view(code.dtype).astype(np.int32)
-    # Sums that wrap around have the right differences: of a probe, 65 535 factors at most, squares fit.
-    running = np.zeros((len(code) + 1, code.shape[1]), np.int32 if code.dtype == np.int8 else np.uint32)
-    np.cumsum((root * np.abs(root)).astype(running.dtype)[code.view(np.uint8)], axis=0, out=running[1:])
-    first, middle, last = running[factor_starts[:-1]], running[sky_starts], running[factor_starts[1:]]
-    sums = (middle - first) * scale[:, BRICKS].astype(np.float64) + (last - middle) * scale[:, SKY].astype(np.float64)
-    return np.asarray(sums / np.iinfo(code.dtype).max ** 2)
+    """(P, B): each probe's shares summed, which must not exceed one; of one factor or more."""
+    wide = np.ascontiguousarray(code.T).astype(np.int16 if code.dtype == np.int8 else np.uint16)
+    first = np.stack([factor_starts[:-1], sky_starts], axis=1).astype(np.int64).reshape(-1)
+    sums = np.zeros((code.shape[1], len(first)), np.int64)
+    has = _run_lengths(factor_starts, sky_starts) > 0
+    sums[:, has] = np.add.reduceat(wide * np.abs(wide), first[has], axis=1, dtype=np.int64)
+    scaled = sums.T.reshape(scale.shape) * scale.astype(np.float64)
+    return np.asarray(scaled.sum(axis=1) / np.iinfo(code.dtype).max ** 2)
 
 
 def sky_starts(factor_starts: AnyArray, is_sky: AnyArray) -> UInt32:

@@ -3,6 +3,8 @@
 Lengths are integers of 1/512 m (2 mm), so that a vertex on a border is the same number in both sectors.
 """
 
+from functools import cache
+
 import numpy as np
 
 from gi_core.arrays import AnyArray, Float32, Float64, Int8, Int32, UInt8, UInt16
@@ -39,12 +41,19 @@ def encode_unit(vectors: AnyArray) -> UInt8:
 
 def decode_unit(octahedral: AnyArray) -> Float32:
     """Octahedral (2, n) uint8 -> unit vectors (n, 3) float32."""
-    u = np.minimum((octahedral.T.astype(np.float64) - 127) / 127, 1.0)
-    y = 1 - np.abs(u).sum(axis=1)
-    folded = (1 - np.abs(u[:, ::-1])) * np.where(u >= 0, 1.0, -1.0)
-    u = np.where(y[:, None] < 0, folded, u)
-    v = np.stack([u[:, 0], y, u[:, 1]], axis=1)
-    return np.asarray(v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-30), np.float32)
+    return _units()[octahedral[0], octahedral[1]]
+
+
+@cache
+def _units() -> Float32:
+    """(256, 256, 3): what each pair of codes stands for."""
+    steps = np.minimum((np.arange(256, dtype=np.float64) - 127) / 127, 1.0)
+    u = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=2)
+    y = 1 - np.abs(u).sum(axis=2)
+    folded = (1 - np.abs(u[..., ::-1])) * np.where(u >= 0, 1.0, -1.0)
+    u = np.where(y[..., None] < 0, folded, u)
+    v = np.stack([u[..., 0], y, u[..., 1]], axis=2)
+    return np.asarray(v / np.maximum(np.linalg.norm(v, axis=2, keepdims=True), 1e-30), np.float32)
 
 
 def encode_root(values: AnyArray) -> UInt8:

@@ -143,7 +143,7 @@ def _sector(found: Container) -> Sector:
         probe_room=_unsigned(found, "probe_room").astype(np.uint16),
         factor_starts=factor_starts,
         factor_source=source,
-        factor_code=np.ascontiguousarray(_weight_codes(found).T),
+        factor_code=container.interleaved(_weight_codes(found)),
         factor_scale=np.ascontiguousarray(np.moveaxis(take("factor_scale", "f2", 3), 2, 0)),
         brick_starts=brick_starts,
         brick_level=brick_level,

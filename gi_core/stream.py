@@ -1,7 +1,10 @@
 """Carries out streaming plans: sectors are read, checked and put on the device by threads of their own, and handed over when ready."""
 
 import logging
+import os
 import queue
+import sys
+import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -22,8 +25,9 @@ log = logging.getLogger("sectorlight.stream")
 
 # Threads that load. Decoding holds Python's lock half of the time: more of them would take it from the ticks.
 LOADERS = 1
+LOADER_NICENESS = 10  # of the 19 there are
 # Bytes on the device of one item, and a little for what is not counted: see ResidentSector and SunSamples.
-_BYTES_PER = {"probes": 256, "factors": 40, "bricks": 64, "surfels": 112, "voxels": 32}
+_BYTES_PER = {"probes": 256, "factors": 16, "bricks": 64, "surfels": 112, "voxels": 32}
 _BYTES_PER_SECTOR = 1 << 15
 
 
@@ -75,7 +79,7 @@ class Streamer:
         self._loading: set[SectorIndex] = set()
         self._rows: Int64 = np.zeros(0, np.int64)
         self._done: queue.SimpleQueue[tuple[SectorIndex, LiveSector | Exception]] = queue.SimpleQueue()
-        self._loaders = ThreadPoolExecutor(LOADERS, thread_name_prefix="sector-loader")
+        self._loaders = ThreadPoolExecutor(LOADERS, thread_name_prefix="sector-loader", initializer=_step_back)
 
     @property
     def loading(self) -> int:
@@ -141,3 +145,9 @@ class Streamer:
         except Exception as error:  # whatever it is, the world goes on without this sector
             found = error
         self._done.put((index, found))
+
+
+def _step_back() -> None:
+    """Have ticks and the device's threads go before the calling one, where the system can do that for one thread (Linux)."""
+    if sys.platform == "linux":
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), LOADER_NICENESS)
