@@ -28,8 +28,8 @@ from gi_core.world import Lamp
 # After a change this large, as a share, a relight makes several passes, so that bounces follow at once.
 BURST_CHANGE = 0.05
 BURST_PASSES = 3
-# Before a sector is shown for the first time: what later bounces add is then a hundredth.
-FIRST_PASSES = 8
+# Before a sector is shown for the first time: what later bounces add is then a twentieth, which comes while it fades in.
+FIRST_PASSES = 4
 # From loaded to fully shown: half a second at 30 Hz, so that nothing pops when a sector arrives late.
 FADE_TICKS = 15
 
@@ -101,10 +101,15 @@ class LiveSector:
         """Whether it is still blended with what stood in for it."""
         return self._faded < FADE_TICKS
 
-    def sample_sun(self, shadow_map: ShadowMap) -> None:
-        """Take samples of a shadow map that was just drawn; they light the sector at its next relight."""
+    def make_room_for_samples(self) -> None:
+        """What ``sample_sun`` would make at its first call, should another thread have the time."""
         if self.samples is None:
             self.samples = SunSamples(self._device, self.resident)
+
+    def sample_sun(self, shadow_map: ShadowMap) -> None:
+        """Take samples of a shadow map that was just drawn; they light the sector at its next relight."""
+        self.make_room_for_samples()
+        assert self.samples is not None
         shadow_map.sample(self.samples)
         self.sampled_of = shadow_map.plan
 

@@ -3,11 +3,12 @@
 import logging
 from collections import OrderedDict
 from collections.abc import Collection, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 
 import numpy as np
 
 from gi_core.arrays import AnyArray, Float64
+from gi_core.background import background_thread
 from gi_core.constants import SECTOR_SIZE_M
 from gi_core.dataset import Dataset
 from gi_core.device import Device
@@ -22,17 +23,19 @@ from gi_core.volume import plan_boxes
 
 log = logging.getLogger("sectorlight.shadows")
 
-# Of one tick: half a millisecond of a core each.
-TRIANGLES_PER_TICK = 3000
+# Of one tick: half a millisecond each on two cores.
+TRIANGLES_PER_TICK = 1000
 SECTORS_SAMPLED_PER_TICK = 2
 # Where many walk, the next tick looks at others.
 PLAYERS_LOOKED_AT_PER_TICK = 4
 # Triangles of sectors towards the sun that are kept in memory, 48 bytes each.
 KEPT_BYTES = 1 << 26
 
+Casters = Mapping[SectorIndex, AnyArray]
+
 
 class LiveShadows:
-    """Decides what the map shows and when; the ticker's alone. Geometry is read by a thread of its own.
+    """Decides what the map shows and when; the ticker's alone. A thread of its own plans maps and reads geometry.
 
     A sector's samples hold wherever players go: they are taken anew when the sun or a box has moved, and when a sector that lay half in
     a map lies whole in another. So a map is drawn only when some player's volume reads a sector whose samples are missing or old.
@@ -44,10 +47,11 @@ class LiveShadows:
         low, high = dataset.world.bounds[:, 1]
         self._heights = float(low), float(high)
         self._map = ShadowMap(device, self._cast, self._heights[1])
-        self._reader = ThreadPoolExecutor(1, thread_name_prefix="shadow-geometry")
-        self._casters: OrderedDict[SectorIndex, Future[AnyArray]] = OrderedDict()
-        self._caster_bytes = 0
-        self._planned: ShadowPlan | None = None
+        self._planner = background_thread("shadow-planner")
+        self._casters: OrderedDict[SectorIndex, AnyArray] = OrderedDict()
+        """What the planner has read, its own."""
+        self._planning: Future[tuple[ShadowPlan | None, Casters]] | None = None
+        self._to_draw: Casters = {}
         self._turn = 0
         self._to_sample: list[SectorIndex] = []
         self._dark = True
@@ -69,7 +73,7 @@ class LiveShadows:
         if not sun_is_up:
             if self._dark:
                 return ()
-            self._planned, self._to_sample, self._dark = None, [], True
+            self._planning, self._to_sample, self._dark = None, [], True
             for sector in residents.values():
                 sector.drop_sun_samples()
             return tuple(residents)
@@ -85,10 +89,12 @@ class LiveShadows:
         if self._map.is_drawing:
             if self._map.draw(TRIANGLES_PER_TICK):
                 self._to_sample = list(covered(self._map.plan, residents))
-        elif self._planned is not None:
-            if all(self._caster(index).done() for index in self._planned.sectors):
-                self._map.begin(self._planned)
-                self._planned = None
+        elif self._planning is not None:
+            if self._planning.done():
+                plan, self._to_draw = self._planning.result()
+                self._planning = None
+                if plan is not None:
+                    self._map.begin(plan)
         elif len(positions):
             self._plan(positions, np.asarray(given.lights["direction"][0, :3], np.float64), boxes, residents)
         return ()
@@ -102,10 +108,7 @@ class LiveShadows:
             here = [index for index in touched if index in residents]
             if any(lacks_samples(residents[index], to_sun, boxes) for index in here):
                 self._turn = player + 1
-                self._planned = plan_map(positions[player], to_sun, self._known, *self._heights, boxes)
-                if self._planned is not None:
-                    for index in self._planned.sectors:
-                        self._caster(index)
+                self._planning = self._planner.submit(self._prepare, positions[player].copy(), to_sun, tuple(boxes))
                 return
         self._turn += PLAYERS_LOOKED_AT_PER_TICK
 
@@ -114,25 +117,27 @@ class LiveShadows:
         index = sector.resident.sector.index
         plan = plan_map(index.origin + 32.0, np.array([0.0, 1.0, 0.0]), {index}, *self._heights)
         assert plan is not None
+        self._to_draw = {index: self._read(index)}
         self._map.begin(plan)
         self._map.draw(1)
         sector.sample_sun(self._map)
 
     def close(self) -> None:
-        """Stop reading."""
-        self._reader.shutdown(cancel_futures=True)
+        """Stop planning."""
+        self._planner.shutdown(cancel_futures=True)
 
-    def _caster(self, index: SectorIndex) -> "Future[AnyArray]":
-        found = self._casters.get(index)
-        if found is None:
-            facts = self._dataset.world.sectors[index]
-            self._caster_bytes += SHADOW_TRIANGLE.dtype.itemsize * facts.triangles
-            found = self._casters[index] = self._reader.submit(self._read, index)
-            while len(self._casters) > 1 and self._caster_bytes > KEPT_BYTES:
-                gone, _ = self._casters.popitem(last=False)
-                self._caster_bytes -= SHADOW_TRIANGLE.dtype.itemsize * self._dataset.world.sectors[gone].triangles
-        self._casters.move_to_end(index)
-        return found
+    def _prepare(self, position: Float64, to_sun: Float64, boxes: tuple[MovingBox, ...]) -> tuple[ShadowPlan | None, Casters]:
+        """In the planner's thread: a map, and the triangles that it draws."""
+        plan = plan_map(position, to_sun, self._known, *self._heights, boxes)
+        if plan is None:
+            return None, {}
+        casters = {}
+        for index in plan.sectors:
+            casters[index] = self._casters[index] = self._casters.pop(index) if index in self._casters else self._read(index)
+        held = sum(records.nbytes for records in self._casters.values())
+        while held > KEPT_BYTES:
+            held -= self._casters.popitem(last=False)[1].nbytes
+        return plan, casters
 
     def _read(self, index: SectorIndex) -> AnyArray:
         try:
@@ -142,7 +147,7 @@ class LiveShadows:
             return np.zeros(0, SHADOW_TRIANGLE.dtype)
 
     def _cast(self, index: SectorIndex) -> AnyArray:
-        return self._caster(index).result()
+        return self._to_draw[index]
 
 
 def lacks_samples(sector: LiveSector, to_sun: Float64, boxes: Sequence[MovingBox]) -> bool:

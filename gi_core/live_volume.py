@@ -12,6 +12,7 @@ from gi_core.constants import BASIS_SIZES, VOLUME_SHAPE, VOXEL_NO_SECTOR
 from gi_core.device import Device
 from gi_core.grid import SectorIndex
 from gi_core.live_sector import LiveSector
+from gi_core.recycled import RecycledArrays
 from gi_core.volume import SectorBox, box_mask, box_record, box_slices, nearest_columns, plan_boxes
 
 # Light of a sector to show at this tick, on the device.
@@ -55,7 +56,8 @@ class _Layout:
 class LiveVolume:
     """One player's. The ticker's alone; what it publishes is anybody's."""
 
-    def __init__(self, device: Device, basis: str = "cube") -> None:
+    def __init__(self, device: Device, basis: str = "cube", arrays: RecycledArrays | None = None) -> None:
+        """``arrays`` : of a volume's shape, shared by volumes."""
         self.basis = basis
         self.published: PublishedVolume | None = None
         self.touched: tuple[SectorIndex, ...] = ()
@@ -64,6 +66,7 @@ class LiveVolume:
         self._first: Int64 = np.zeros(3, np.int64)
         self._layout: _Layout | None = None
         self._present: frozenset[SectorIndex] = frozenset()
+        self._arrays = arrays or volume_arrays(basis)
         self._buffer = device.allocate(4 * 3 * BASIS_SIZES[basis] * int(np.prod(VOLUME_SHAPE)))
         self._filled_at = -1
 
@@ -93,7 +96,7 @@ class LiveVolume:
         """Read what ``enqueue`` asked for, put placeholders in, and show it."""
         layout = self._layout
         assert layout is not None
-        values = np.empty((BASIS_SIZES[self.basis], *VOLUME_SHAPE, 3), np.float32)
+        values = self._arrays.take()
         self._device.read(self._buffer, values)
         for index, z, x in layout.placeholders:
             values[:, :, z, x] = (from_axes(self.basis) @ placeholder(index))[:, None, None, None]
@@ -105,6 +108,11 @@ class LiveVolume:
         missing = tuple(index for index, _, _ in layout.placeholders)
         self.published = PublishedVolume(values, layout.mask, self._first, tick, layout.sectors, missing, self.basis)
         return self.published
+
+
+def volume_arrays(basis: str) -> RecycledArrays:
+    """What volumes in a basis are read into."""
+    return RecycledArrays((BASIS_SIZES[basis], *VOLUME_SHAPE, 3))
 
 
 def _lay_out(

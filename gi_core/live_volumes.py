@@ -12,7 +12,7 @@ from gi_core.arrays import Float32, Float64
 from gi_core.device import Device
 from gi_core.grid import SectorIndex, volume_first_voxel
 from gi_core.live_sector import LiveSector
-from gi_core.live_volume import LiveVolume, ShownCubes
+from gi_core.live_volume import LiveVolume, ShownCubes, volume_arrays
 
 # A new player's first volume is held back until all of its sectors are lit, but not for longer than two seconds at 30 Hz.
 HELD_TICKS = 60
@@ -29,6 +29,7 @@ class LiveVolumes:
         self.looked_at: Counter[SectorIndex] = Counter()
         """How many published volumes read each sector, there or not."""
         self._device, self._known, self._residents, self._basis = device, known, residents, basis
+        self._arrays = volume_arrays(basis)
         self._firsts: dict[str, bytes] = {}
         self._readers: dict[SectorIndex, set[str]] = {}
         self._stale: dict[str, int] = {}
@@ -56,7 +57,7 @@ class LiveVolumes:
                 self._firsts[name] = place
                 volume = self.of_player.get(name)
                 if volume is None:
-                    volume = self.of_player[name] = LiveVolume(self._device, self._basis)
+                    volume = self.of_player[name] = LiveVolume(self._device, self._basis, self._arrays)
                 self._unread(name, volume)
                 volume.move(firsts[row], self._known)
                 for index in volume.touched:

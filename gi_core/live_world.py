@@ -209,6 +209,8 @@ class LiveWorld:
         placed = LiveSector(self._device, sector, self.dataset.world.sky_patches, self._geometry, self._tracing)
         if self._light is not None:
             placed.set_lamps(self._light, wait=True)
+            if self._shadows is not None and self._light.sun_is_up:
+                placed.make_room_for_samples()
         return placed
 
     def _relight(self, tick: int, light: LiveLight, report: TickReport) -> None:

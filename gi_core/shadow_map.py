@@ -20,8 +20,8 @@ from gi_core.sector import counts
 from gi_core.shadow_plan import MAP_TEXELS, ShadowPlan, box_corners, oldest_fresh, triangle_records
 
 NOTHING_DRAWN = np.float32(-1e30)  # as in shadow_map.h
-# A band belongs to one work-item. A CPU wants some for each core; a GPU wants many.
-CPU_BANDS, GPU_BANDS = 8, 256
+# Each work-item looks at every triangle. A CPU wants few of them, though more than cores; a GPU wants many.
+CPU_ITEMS_PER_CORE, GPU_ITEMS = 2, 256
 # Triangles of sectors that stay on the device for the next map, 48 bytes each.
 KEPT_BYTES = 1 << 25
 # Maps are numbered with 16 bits; samples start anew when they run out.
@@ -88,7 +88,8 @@ class ShadowMap:
         self._front, self._back = (cl.Buffer(device.context, cl.mem_flags.READ_WRITE, 4 * MAP_TEXELS * SHADOW_ROW_TEXELS) for _ in range(2))
         self._draw = device.shared_kernel("draw_shadow_map")
         self._sample = device.shared_kernel("sample_shadow_map")
-        self._bands = CPU_BANDS if device.device.type & cl.device_type.CPU else GPU_BANDS
+        is_cpu = device.device.type & cl.device_type.CPU
+        self._rows_apart = CPU_ITEMS_PER_CORE * device.device.max_compute_units if is_cpu else GPU_ITEMS
         self._triangles: OrderedDict[SectorIndex, tuple[cl.Buffer, int]] = OrderedDict()
         self._kept_bytes = 0
         self._drawn_for: list[tuple[int, Float64]] = []
@@ -168,8 +169,7 @@ class ShadowMap:
 
     def _enqueue(self, plan: ShadowPlan, origin: Float64, triangles: cl.Buffer, count: int) -> None:
         if count:
-            rows = np.int32(-(-MAP_TEXELS // self._bands))
-            self._draw.launch((self._bands,), (1,), plan.frame(origin), np.uint32(count), triangles, rows, self._back)
+            self._draw.launch((self._rows_apart,), (1,), plan.frame(origin), np.uint32(count), triangles, self._back)
 
     def _on_device(self, index: SectorIndex) -> tuple[cl.Buffer, int]:
         found = self._triangles.pop(index, None)

@@ -1,18 +1,15 @@
 """Carries out streaming plans: sectors are read, checked and put on the device by threads of their own, and handed over when ready."""
 
 import logging
-import os
 import queue
-import sys
-import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 
 from gi_core.arrays import Float64, Int64
+from gi_core.background import background_thread
 from gi_core.constants import BASIS_SIZES
 from gi_core.dataset import SectorFacts, WorldInfo
 from gi_core.grid import SectorIndex
@@ -23,9 +20,6 @@ from gi_core.stream_plan import StreamOptions, StreamPlan, StreamState, plan_str
 
 log = logging.getLogger("sectorlight.stream")
 
-# Threads that load. Decoding holds Python's lock half of the time: more of them would take it from the ticks.
-LOADERS = 1
-LOADER_NICENESS = 10  # of the 19 there are
 # Bytes on the device of one item, and a little for what is not counted: see ResidentSector and SunSamples.
 _BYTES_PER = {"probes": 256, "factors": 16, "bricks": 64, "surfels": 112, "voxels": 32}
 _BYTES_PER_SECTOR = 1 << 15
@@ -79,7 +73,8 @@ class Streamer:
         self._loading: set[SectorIndex] = set()
         self._rows: Int64 = np.zeros(0, np.int64)
         self._done: queue.SimpleQueue[tuple[SectorIndex, LiveSector | Exception]] = queue.SimpleQueue()
-        self._loaders = ThreadPoolExecutor(LOADERS, thread_name_prefix="sector-loader", initializer=_step_back)
+        # One thread: decoding holds Python's lock half of the time, and more would take it from the ticks.
+        self._loader = background_thread("sector-loader")
 
     @property
     def loading(self) -> int:
@@ -127,7 +122,7 @@ class Streamer:
         for index in plan.loads:
             self._loading.add(index)
             self._state.loading[self._row[index]] = True
-            self._loaders.submit(self._bring, index)
+            self._loader.submit(self._bring, index)
         self.misses += len(plan.missing)
         return plan
 
@@ -137,7 +132,7 @@ class Streamer:
 
     def close(self) -> None:
         """Stop loading; waits for what is under way."""
-        self._loaders.shutdown(cancel_futures=True)
+        self._loader.shutdown(cancel_futures=True)
 
     def _bring(self, index: SectorIndex) -> None:
         try:
@@ -145,9 +140,3 @@ class Streamer:
         except Exception as error:  # whatever it is, the world goes on without this sector
             found = error
         self._done.put((index, found))
-
-
-def _step_back() -> None:
-    """Have ticks and the device's threads go before the calling one, where the system can do that for one thread (Linux)."""
-    if sys.platform == "linux":
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), LOADER_NICENESS)
