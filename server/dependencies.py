@@ -64,7 +64,9 @@ class PositionQuery(LightingQuery):
 
 class VolumeFormatQuery(StrictQuery):
     format: ArrayFormat = "npy"
-    encoding: RawEncoding = Field("f16", description="of format=raw: RGBA half floats; lux = rgb x scale; alpha = 1 in free air, else 0")
+    encoding: RawEncoding = Field(
+        "f16", description="of format=raw: RGBA halves, alpha = 1 in free air, else 0; or rgb9e5, half the bytes; lux = rgb x scale"
+    )
     mask: bool = Field(False, description="1: the voxels' classes (uint8) instead of light")
 
 
@@ -82,7 +84,7 @@ class PlayerVolumeQuery(VolumeFormatQuery):
 
 class DistantQuery(LightingQuery):
     format: ArrayFormat = "npy"
-    encoding: RawEncoding = "f16"
+    encoding: Literal["f16"] = "f16"
 
 
 class ProbesQuery(PositionQuery):

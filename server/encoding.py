@@ -10,12 +10,14 @@ import numpy as np
 from gi_core.arrays import AnyArray, Float32, UInt8, UInt16
 
 ArrayFormat = Literal["npy", "raw"]
-RawEncoding = Literal["f16"]
+RawEncoding = Literal["f16", "rgb9e5"]
 
 # Changes whenever the bytes of a reply change for the same data; part of every ETag.
 REPLY_VERSION = 3
 
 HALF_MAX = 65504.0
+SHARED_EXPONENT_MAX = 65408.0  # 511 / 512 x 2^16
+_MANTISSA_BITS, _EXPONENT_BIAS = 9, 15
 _HALF_ONE = np.uint16(0x3C00)
 _LEAST_NORMAL_HALF = (127 - 14) << 23  # bits of the float32 2^-14
 MEDIA_TYPE: dict[ArrayFormat, str] = {"npy": "application/x-npy", "raw": "application/octet-stream"}
@@ -65,6 +67,28 @@ def _half_bits(values: Float32) -> UInt16:
     if tiny.any():
         halves[tiny] = values[tiny].astype(np.float16).view(np.uint16)
     return halves
+
+
+def shared_exponent_scale(values: Float32) -> float:
+    """As ``half_scale``, for ``shared_exponent_texels``."""
+    peak = float(values.max(initial=0.0))
+    return 1.0 if peak <= 0 else float(2.0 ** np.ceil(np.log2(peak / SHARED_EXPONENT_MAX)))
+
+
+def shared_exponent_texels(values: Float32, scale: float) -> bytes:
+    """Colours (..., 3) [lx], none negative, as little-endian RGB9E5 words (...), colour / scale: nine bits a channel, least significant
+    red, and above them five of the exponent that the three share (OpenGL's EXT_texture_shared_exponent). Off by 2^-9 of the texel's
+    brightest channel at most."""
+    colour = np.maximum(values.astype(np.float64) / scale, 0.0)
+    brightest = colour.max(axis=-1)
+    # frexp has the brightest as 0.5..1 times 2 to this; rounding its mantissa up to 512 takes one more.
+    exponent = np.where(brightest > 0, np.maximum(np.frexp(brightest)[1], -_EXPONENT_BIAS), -_EXPONENT_BIAS)
+    exponent += np.rint(np.ldexp(brightest, _MANTISSA_BITS - exponent)) == 1 << _MANTISSA_BITS
+    mantissa = np.rint(np.ldexp(colour, (_MANTISSA_BITS - exponent)[..., None])).astype(np.uint32)
+    words = (exponent + _EXPONENT_BIAS).astype(np.uint32) << 3 * _MANTISSA_BITS
+    for channel in range(3):
+        words |= mantissa[..., channel] << channel * _MANTISSA_BITS
+    return words.astype("<u4").tobytes()
 
 
 def header_json(facts: Mapping[str, Any]) -> str:

@@ -6,7 +6,16 @@ import json
 import numpy as np
 import pytest
 
-from server.encoding import HALF_MAX, half_scale, half_texels, header_json, npy
+from server.encoding import (
+    HALF_MAX,
+    SHARED_EXPONENT_MAX,
+    half_scale,
+    half_texels,
+    header_json,
+    npy,
+    shared_exponent_scale,
+    shared_exponent_texels,
+)
 
 
 def decoded(values: np.ndarray) -> np.ndarray:
@@ -68,3 +77,33 @@ def test_halves_are_those_that_numpy_makes() -> None:
     texels = np.frombuffer(half_texels(values, 1.0), "<u2").reshape(-1, 4)
     assert np.array_equal(texels[:, :3], values.astype(np.float16).view(np.uint16))
     assert (texels[:, 3].view(np.float16) == 1).all()
+
+
+def shared_decoded(texels: bytes, shape: tuple[int, ...], scale: float) -> np.ndarray:
+    """As the extension has it, written apart from the encoder: mantissa x 2^(exponent - 15 - 9)."""
+    words = np.frombuffer(texels, "<u4").reshape(shape)
+    mantissa = np.stack([words >> shift & 511 for shift in (0, 9, 18)], axis=-1)
+    return mantissa * 2.0 ** ((words >> 27).astype(int) - 24)[..., None] * scale
+
+
+@pytest.mark.parametrize("peak", [1e-3, 1.0, 65408.0, 65409.0, 1.2e5, 1e9, 1e30])
+def test_shared_exponents_keep_nine_bits_of_a_texel_s_brightest_channel(peak: float) -> None:
+    rng = np.random.default_rng(0)
+    values = (peak * rng.uniform(0, 1, (500, 3)) * 10.0 ** rng.uniform(-6, 0, (500, 1))).astype(np.float32)
+    values[0] = peak
+    scale = shared_exponent_scale(values)
+    assert SHARED_EXPONENT_MAX / 2 < peak / scale <= SHARED_EXPONENT_MAX
+    off = np.abs(shared_decoded(shared_exponent_texels(values, scale), (500,), scale) - values)
+    # Half a step: the brightest mantissa is 256 or more, so a step is at most 1/256 of it.
+    assert (off <= values.max(axis=1, keepdims=True) / 512 * (1 + 1e-6)).all()
+
+
+def test_a_known_word_has_a_known_colour() -> None:
+    # 1, 0.5 and 0: exponent 16, since a mantissa stays below 512; 256 and 128.
+    assert shared_exponent_texels(np.array([[1.0, 0.5, 0.0]], np.float32), 1.0) == (16 << 27 | 128 << 9 | 256).to_bytes(4, "little")
+    assert shared_exponent_texels(np.zeros((1, 3), np.float32), 1.0) == bytes(4)
+
+
+def test_a_mantissa_that_rounds_up_to_512_takes_the_next_exponent() -> None:
+    values = np.array([[1023.9, 0.0, 0.0]], np.float32)
+    np.testing.assert_allclose(shared_decoded(shared_exponent_texels(values, 1.0), (1,), 1.0), [[1024, 0, 0]])

@@ -96,3 +96,12 @@ def test_probes_and_pictures_are_served_from_harmonics_too(angled: httpx.Client)
     assert picture.status_code == 200
     distant = np.load(io.BytesIO(angled.get("/v1/distant", params={"time": "12:00", "weather": "clear"}).content))
     assert distant.shape[2:] == (6, 3)
+
+
+def test_texels_without_a_sign_are_the_cube_s_alone(angled: httpx.Client) -> None:
+    raw = {**PLACE, "format": "raw", "encoding": "rgb9e5"}
+    cube = angled.get("/v1/volume", params=raw)
+    facts = json.loads(cube.headers["Gi-Volume"])
+    assert (facts["shape"], facts["dtype"], len(cube.content)) == ([6, *VOLUME_SHAPE], "rgb9e5", 4 * 6 * 16 * 32 * 32)
+    refused = angled.get("/v1/volume", params={**raw, "basis": "sh2"})
+    assert (refused.status_code, "rgb9e5" in refused.json()["detail"]) == (400, True)

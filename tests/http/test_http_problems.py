@@ -23,7 +23,7 @@ BAD: list[tuple[str, dict[str, str], str]] = [
     ("/v1/volume", {"time": "12:00"}, "weather"),
     ("/v1/volume", {**GOOD, "format": "exe"}, "'npy' or 'raw'"),
     ("/v1/volume", {**GOOD, "format": "ktx2"}, "'npy' or 'raw'"),
-    ("/v1/volume", {**GOOD, "format": "raw", "encoding": "rgb9e5"}, "'f16'"),
+    ("/v1/volume", {**GOOD, "format": "raw", "encoding": "bc6h"}, "'f16'"),
     ("/v1/volume", {**GOOD, "basis": "sh2"}, "baked in cube; expected cube, found sh2"),
     ("/v1/volume", {**GOOD, "cascade": "3"}, "cascade"),
     ("/v1/volume", {**GOOD, "kind": "interior"}, "'outdoor'"),
