@@ -13,6 +13,8 @@ other voxel filled from the nearest of them, as the server fills its solid ones.
 All is in the dataset's basis: of harmonics, what they say of the six faces is compared with what exact harmonics would say. Their
 dataset has two stages more, ``shaded_cube`` and ``floor_cube``: the same points when the cube is served instead.
 
+A dataset with fine voxels has ``shaded_fine``: the same points read from volumes of cascade -1.
+
 Of the dataset only the served light is believed. Points come from ``compare_points``; surroundings that a partial bake leaves out
 must be handed in as ``scene``, or the reference is lit through the gap.
 """
@@ -31,7 +33,7 @@ from bake_jobs.path_tracer import Estimate, PathTracer, Projector
 from bake_jobs.scene import Scene
 from gi_core.arrays import Float32, Float64, Int64
 from gi_core.basis import conversion, projection_weights
-from gi_core.constants import BASIS_SIZES, SECTOR_SIZE_M, VOLUME_SHAPE, VOXEL_NO_SECTOR, VOXEL_OUTDOORS
+from gi_core.constants import BASIS_SIZES, FINE_VOXEL_SIZE_M, SECTOR_SIZE_M, VOLUME_SHAPE, VOXEL_NO_SECTOR, VOXEL_OUTDOORS
 from gi_core.dataset import Dataset
 from gi_core.engine import Engine
 from gi_core.errors import InputError
@@ -46,6 +48,9 @@ GEOMETRY_REACH_M = 1024.0
 DEFAULT_SECTORS = 9
 STAGES = ("probes", "near", "mid", "shaded", "floor")
 CUBE_STAGES = ("shaded_cube", "floor_cube")
+FINE_STAGES = ("shaded_fine",)
+# A volume of cascade -1 covers this much around its centre, wherever the lattice has it.
+FINE_TILE_M = FINE_VOXEL_SIZE_M * (np.array([VOLUME_SHAPE[2], VOLUME_SHAPE[0], VOLUME_SHAPE[1]]) - 4)
 Progress = Callable[[int, int, str], None]
 
 
@@ -126,7 +131,7 @@ def compare_dataset(
     lightings = {state.name: engine.lighting(state.time, state.weather) for state in moments}
     tracer = _tracer(dataset, chosen, scene)
     bases = (world.basis,) if world.basis == "cube" else (world.basis, "cube")
-    all_stages = STAGES if len(bases) == 1 else STAGES + CUBE_STAGES
+    all_stages = STAGES + (CUBE_STAGES if len(bases) > 1 else ()) + (FINE_STAGES if world.has_fine_voxels else ())
     found = {state: {stage: StageSamples() for stage in all_stages} for state in lightings}
     air = {"open": 0, "called_solid": 0}
 
@@ -147,7 +152,11 @@ def compare_dataset(
             _compare_voxels(stages["near"], volume, points.near, reference)
             _compare_voxels(stages["mid"], volume, points.mid, reference)
             served = [volume, *(engine.volume(points.eye, lighting, basis=basis) for basis in bases[1:])]
-            _compare_surfaces([(stages[a], stages[b]) for a, b in (STAGES[3:], CUBE_STAGES)[: len(bases)]], served, points, reference)
+            truth = reference.surfaces(points.surface, points.normal)
+            on_surfaces = [(stages[a], stages[b]) for a, b in (STAGES[3:], CUBE_STAGES)[: len(bases)]]
+            _compare_surfaces(on_surfaces, served, points, reference, truth)
+            if world.has_fine_voxels:
+                stages["shaded_fine"].add(_fine_light(engine, lighting, points), truth)
             if progress is not None:
                 progress(number * len(lightings) + place + 1, len(chosen) * len(lightings), f"sector {index.x},{index.z} {state}")
     if not any(samples.count for stages in found.values() for samples in stages.values()):
@@ -217,16 +226,15 @@ def _six_faces(light: Float32, basis: str) -> Float32:
 
 
 def _compare_surfaces(
-    stages: list[tuple[StageSamples, StageSamples]], served: list[Volume], points: SectorPoints, reference: Reference
+    stages: list[tuple[StageSamples, StageSamples]], served: list[Volume], points: SectorPoints, reference: Reference, truth: Estimate
 ) -> None:
-    """Shaded and floor, of the volume in each basis that it is served in. All stages on surfaces share their reference."""
+    """Shaded and floor, of the volume in each basis that it is served in. All stages on surfaces share their reference, ``truth``."""
     normal = points.normal.astype(np.float32)
     volume = served[0]
 
     def as_client(values: Float32) -> Float32:
         return sample_volume(values, volume.origin, volume.voxel_size, points.surface, normal)
 
-    truth = reference.surfaces(points.surface, points.normal)
     for (shaded, _), found in zip(stages, served, strict=True):
         shaded.add(as_client(found.values), truth)
     if not points.open_voxel.any():
@@ -243,3 +251,15 @@ def _compare_surfaces(
         noise[:, y, z, x] = exact.standard_error[of_corner].transpose(1, 0, 2)
         # Corners' errors are independent, so their weighted sum overstates the noise: an upper bound. Harmonics' are not of one sign.
         floor.add(as_client(values), Estimate(truth.mean, np.hypot(truth.standard_error, np.abs(as_client(noise)))))
+
+
+def _fine_light(engine: Engine, lighting: Lighting, points: SectorPoints) -> Float32:
+    """What a client reads at surfaces (n, 3) from as many volumes of cascade -1 as it takes: (n, 3) [lx]."""
+    tile, of_point = np.unique(np.floor(points.surface / FINE_TILE_M).astype(np.int64), axis=0, return_inverse=True)
+    light = np.zeros((len(points.surface), 3), np.float32)
+    for number, centre in enumerate((tile + 0.5) * FINE_TILE_M):
+        some = of_point.reshape(-1) == number
+        volume = engine.fine_volume(centre, lighting)
+        normal = points.normal[some].astype(np.float32)
+        light[some] = sample_volume(volume.values, volume.origin, volume.voxel_size, points.surface[some], normal)
+    return light

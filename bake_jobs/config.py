@@ -9,7 +9,7 @@ from gi_core.errors import InputError
 from gi_core.sector_file import MAX_BLENDED_PROBES
 from gi_core.sky_patches import MIN_PATCHES, SKY_SCHEMES
 
-Preset = Literal["draft", "talk", "standard"]
+Preset = Literal["draft", "talk", "standard", "reference"]
 PRESETS: tuple[str, ...] = get_args(Preset)
 KNOB_CHOICES: dict[str, tuple[str, ...]] = {
     "basis": tuple(BASIS_SIZES),
@@ -24,6 +24,10 @@ KNOB_RANGES = {
     "voxel_probes": (1, MAX_BLENDED_PROBES),
     "voxel_candidates": (1, 256),
     "rays_per_face_edge": (2, 256),
+    "voxel_levels": (1, 2),
+    "probe_worth": (1e-5, 1e4),
+    "fit_ridge": (1e-6, 1e4),
+    "target_error": (1e-3, 1.0),
     "sun_declination_step_degrees": (1, 46),
     "sun_hour_step_degrees": (1, 90),
 }
@@ -50,6 +54,7 @@ class BakeSettings:
     sun_declination_step_degrees, sun_hour_step_degrees : spacing of the baked sun directions; less: sharper shadows, larger files
     voxel_probes : probes that a voxel blends at most
     voxel_candidates : nearest probes that are tested for visibility from a voxel
+    voxel_levels : 1, the talk's voxels of 3.125 m; 2, near surfaces also some of half that, for volumes of cascade -1
     feedback_probes : probes that light a surfel, the closest of those that see it; more: smoother bounces, more to do at each relight
     placement : "grid", ground grid and walls; "adaptive", where light changes (bake_jobs/adaptive.py)
     voxel_weights : "nearest", visible probes by distance; "fitted", to trial light (bake_jobs/fit.py)
@@ -80,6 +85,7 @@ class BakeSettings:
     sun_hour_step_degrees: float = 15.0
     voxel_probes: int = 4
     voxel_candidates: int = 8
+    voxel_levels: int = 1
     feedback_probes: int = 1
     placement: str = "grid"
     voxel_weights: str = "nearest"
@@ -101,6 +107,8 @@ class BakeSettings:
         knobs = asdict(self)
         if self.sky == "faces":
             del knobs["sky_patches"]
+        if self.voxel_levels == 1:
+            del knobs["voxel_levels"]
         return knobs
 
 
@@ -156,4 +164,6 @@ def settings_for(preset: str) -> BakeSettings:
     if preset == "standard":
         # One feedback probe: with probes as close together as these, more of them were no better (MATH.md, "What each idea is worth").
         return BakeSettings(preset="standard", basis="sh2", sky="patches", **ADAPTIVE)
+    if preset == "reference":
+        return BakeSettings(preset="reference", basis="sh2", sky="patches", sky_patches=96, probe_worth=0.001, voxel_levels=2, **ADAPTIVE)
     raise InputError(f"quality {preset!r}: expected one of {', '.join(PRESETS)}")

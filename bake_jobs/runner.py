@@ -30,9 +30,9 @@ from bake_jobs.scene import Scene, scene_digest
 from bake_jobs.scene_source import load_scene
 from bake_jobs.sector_job import SectorBaker
 from bake_jobs.summary import print_summary
-from gi_core import distant_file, geometry_file, sector_file
+from gi_core import distant_file, fine_file, geometry_file, sector_file
 from gi_core.container import write_atomic
-from gi_core.dataset import COUNTS, DISTANT_FILE, WORLD_FILE, SectorFacts, WorldInfo, geometry_path, sector_path, write_world
+from gi_core.dataset import COUNTS, DISTANT_FILE, WORLD_FILE, SectorFacts, WorldInfo, fine_path, geometry_path, sector_path, write_world
 from gi_core.errors import FormatError, InputError, SectorlightError
 from gi_core.grid import SectorIndex
 from gi_core.json_fields import LARGEST_INTEGER
@@ -113,7 +113,7 @@ def bake(
         output.mkdir(parents=True, exist_ok=True)
         if restart:
             _clear(output)
-    done = {i: f for i in wanted if (f := _finished(output, i, bake_id)) is not None}
+    done = {i: f for i in wanted if (f := _finished(output, i, bake_id, settings.voxel_levels > 1)) is not None}
     remaining = [i for i in wanted if i not in done]
     if done:
         console.print(f"{len(done)} of {len(wanted)} sectors are finished already; baking the other {len(remaining)}")
@@ -191,32 +191,40 @@ def _chosen(available: list[SectorIndex], sectors: SectorRange | None) -> list[S
 
 def _clear(output: Path) -> None:
     """Remove what a bake writes, and nothing else that the folder may hold."""
-    for name in ("sectors", "geometry"):
+    for name in ("sectors", "geometry", "fine"):
         shutil.rmtree(output / name, ignore_errors=True)
     for name in (WORLD_FILE, DISTANT_FILE):
         (output / name).unlink(missing_ok=True)
 
 
-def _facts(sector_bytes: bytes, geometry_bytes: int, meta: dict[str, Any]) -> SectorFacts:
+def _facts(sector_bytes: bytes, geometry_bytes: int, fine_bytes: int | None, meta: dict[str, Any]) -> SectorFacts:
     counted = {name: int(meta[name]) for name in COUNTS if name not in ("bytes", "geometry_bytes")}
     digest = hashlib.blake2b(sector_bytes, digest_size=16).hexdigest()
     return SectorFacts(
-        bytes=len(sector_bytes), digest=digest, geometry_bytes=geometry_bytes, estimated_error=meta.get("estimated_error"), **counted
+        bytes=len(sector_bytes),
+        digest=digest,
+        geometry_bytes=geometry_bytes,
+        fine_bytes=fine_bytes,
+        estimated_error=meta.get("estimated_error"),
+        **counted,
     )
 
 
-def _finished(output: Path, index: SectorIndex, bake_id: str) -> _Finished | None:
+def _finished(output: Path, index: SectorIndex, bake_id: str, has_fine: bool) -> _Finished | None:
     """A sector of this very bake that an earlier run completed, or None."""
-    path, geometry = sector_path(output, index), geometry_path(output, index)
+    path, geometry, fine = sector_path(output, index), geometry_path(output, index), fine_path(output, index)
     if not path.is_file() or not geometry.is_file():
         return None
     try:
         data = path.read_bytes()
         sector, meta = sector_file.decode(data, str(path))
-        _, cut, cut_id = geometry_file.read(geometry)
-        if {sector.index, cut} != {index} or {meta["bake_id"], cut_id} != {bake_id}:
+        others = [geometry_file.read(geometry)[1:]]
+        if has_fine:
+            others.append(fine_file.read(fine)[1:])
+        if any(other != (index, bake_id) for other in [(sector.index, meta["bake_id"]), *others]):
             return None
-        return _Finished(index, _facts(data, geometry.stat().st_size, meta), meta["distant_sky"], 0.0)
+        fine_bytes = fine.stat().st_size if has_fine else None
+        return _Finished(index, _facts(data, geometry.stat().st_size, fine_bytes, meta), meta["distant_sky"], 0.0)
     except (OSError, FormatError, KeyError, TypeError, ValueError):
         return None  # damaged: bake it again
 
@@ -255,9 +263,12 @@ def _bake_one(index: SectorIndex) -> _Finished:
     baked = _baker.bake(index)
     with _writing(_output):
         write_atomic(geometry_path(_output, index), baked.geometry_bytes)
-        # The sector file comes last: where it is, both are.
+        if baked.fine_bytes is not None:
+            write_atomic(fine_path(_output, index), baked.fine_bytes)
+        # The sector file comes last: where it is, all are.
         write_atomic(sector_path(_output, index), baked.sector_bytes)
-    facts = _facts(baked.sector_bytes, len(baked.geometry_bytes), baked.meta)
+    fine_bytes = None if baked.fine_bytes is None else len(baked.fine_bytes)
+    facts = _facts(baked.sector_bytes, len(baked.geometry_bytes), fine_bytes, baked.meta)
     return _Finished(index, facts, baked.meta["distant_sky"], time.process_time() - started)
 
 

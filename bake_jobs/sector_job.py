@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from bake_jobs import adaptive, factors, gbuffer, placement, sun_visibility, surfels, voxels
+from bake_jobs import adaptive, factors, fine_voxels, gbuffer, placement, sun_visibility, surfels, voxels
 from bake_jobs.air import find_air
 from bake_jobs.config import BakeSettings
 from bake_jobs.geometry_clip import SectorCutter
@@ -15,7 +15,7 @@ from bake_jobs.scene import Scene
 from bake_jobs.target_error import probes_for_target
 from bake_jobs.trial_light import TrialScene
 from bake_jobs.trial_states import trial_states
-from gi_core import factor_weights, geometry_file, sector_file
+from gi_core import factor_weights, fine_file, geometry_file, sector_file
 from gi_core.arrays import Float32, Float64
 from gi_core.constants import ALBEDO_MAX, ROOM_OUTDOORS
 from gi_core.geometry_file import Geometry
@@ -25,11 +25,12 @@ from gi_core.sector import PROBE_IN_MARGIN, Sector
 
 @dataclass(frozen=True, eq=False)
 class BakedSector:
-    """A sector's two files and what the summary says of it."""
+    """A sector's files and what the summary says of it; ``fine_bytes`` is None where no fine voxels were asked for."""
 
     index: SectorIndex
     sector_bytes: bytes
     geometry_bytes: bytes
+    fine_bytes: bytes | None
     meta: dict[str, Any]
 
 
@@ -49,24 +50,32 @@ class SectorBaker:
         self.trial = self._trial_scene() if settings.placement == "adaptive" or settings.voxel_weights == "fitted" else None
 
     def bake(self, index: SectorIndex) -> BakedSector:
-        """Both files of one sector."""
+        """All files of one sector."""
         geometry = self.cutter.cut(index)
-        sector, meta = self.bake_arrays(index, geometry)
+        placed, trial = self.place(index)
+        sector, meta = self._arrays(index, geometry, placed, trial)
         sector_bytes = sector_file.encode(sector, meta, self._settings.sky_sources)
-        return BakedSector(index, sector_bytes, geometry_file.encode(index, geometry, self._bake_id), meta)
+        fine = None
+        if self._settings.voxel_levels > 1:
+            rooms, around = self._scene.rooms, (self.rays, self._solids, _surfaces(geometry), index)
+            found = fine_voxels.bake_fine_voxels(*around, placed, self._settings, rooms, trial, self.trial)
+            fine = fine_file.encode(index, found, self._bake_id)
+        return BakedSector(index, sector_bytes, geometry_file.encode(index, geometry, self._bake_id), fine, meta)
 
     def bake_arrays(self, index: SectorIndex, geometry: Geometry) -> tuple[Sector, dict[str, Any]]:
         """One sector's arrays before quantisation, and its meta. ``geometry`` is what SectorCutter.cut gives for it."""
+        return self._arrays(index, geometry, *self.place(index))
+
+    def _arrays(
+        self, index: SectorIndex, geometry: Geometry, placed: placement.Placement, trial: adaptive.Trial | None
+    ) -> tuple[Sector, dict[str, Any]]:
         scene, settings, rays = self._scene, self._settings, self.rays
-        placed, trial = self.place(index)
         seen = gbuffer.render(rays, placed.position, self._pattern)
         room = surfels.rooms_of_hits(seen, placed.room, scene.rooms)
         clustered = surfels.cluster(seen, room, index.origin, scene.albedo, scene.emission, settings.cells_double_beyond_m)
         weights = factors.gather(seen, self._pattern, clustered, None if settings.sky == "faces" else settings.sky_patches)
         feedback_probe, feedback_weight = surfels.feedback(clustered, seen, settings.feedback_probes)
-        heights = geometry.vertices[:, 1] if len(geometry.vertices) else np.zeros(1)
-        surfaces = np.array([heights.min(), heights.max()])
-        lattice = voxels.bake_voxels(rays, self._solids, surfaces, index, placed, settings, scene.rooms, trial)
+        lattice = voxels.bake_voxels(rays, self._solids, _surfaces(geometry), index, placed, settings, scene.rooms, trial)
         emits = bool(clustered.emission.any())
         factor_code, factor_scale = factor_weights.encode(weights.weight, weights.starts, weights.source >= len(clustered.brick_cell))
         sector = Sector(
@@ -136,6 +145,12 @@ class SectorBaker:
             cube = trial.light(placed.position).cube
         fitted = adaptive.Trial(trial.states, air, light, cube) if settings.voxel_weights == "fitted" else None
         return placed, fitted
+
+
+def _surfaces(geometry: Geometry) -> Float64:
+    """(2,) [m]: the lowest and highest surface."""
+    heights = geometry.vertices[:, 1] if len(geometry.vertices) else np.zeros(1)
+    return np.array([heights.min(), heights.max()])
 
 
 def _distant_sky(sky: Float32, placed: placement.Placement) -> list[float]:

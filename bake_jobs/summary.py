@@ -30,6 +30,9 @@ def print_summary(console: Console, world: WorldInfo, core_seconds: float, wall_
         table.add_row(name, f"{counts[name]:,}", f"{counts[name] / sectors:,.0f}")
     table.add_row("sector files", f"{counts['bytes'] / 1e6:,.1f} MB", f"{counts['bytes'] / 1e3 / sectors:,.0f} kB")
     table.add_row("geometry files", f"{counts['geometry_bytes'] / 1e6:,.1f} MB", f"{counts['geometry_bytes'] / 1e3 / sectors:,.1f} kB")
+    if world.has_fine_voxels:
+        fine = sum(facts.fine_bytes or 0 for facts in world.sectors.values())
+        table.add_row("fine voxel files", f"{fine / 1e6:,.1f} MB", f"{fine / 1e3 / sectors:,.0f} kB")
     if baked:
         table.add_row("core time", f"{core_seconds:,.1f} s", f"{core_seconds / baked:,.2f} s")
         table.add_row(f"time, {workers} processes", f"{wall_seconds:,.1f} s", f"{wall_seconds / baked:,.2f} s")

@@ -57,7 +57,8 @@ def bake_voxels(
 ) -> Voxels:
     """Voxels of a sector. ``surfaces`` (2,) [m] are the lowest and highest surface in it; weights are fitted to ``trial`` where it has
     light, and go by distance elsewhere."""
-    lattice, shape = _lattice(index, surfaces)
+    top = max(float(surfaces[1]) + AIR_ABOVE_TOP_M, float(surfaces[0]) + AIR_ABOVE_GROUND_M)
+    lattice, shape = sector_lattice(index, float(surfaces[0]), top, VOXEL_SIZE_M)
     centre = voxel_centre(lattice.reshape(-1, 3))
     room = room_of(centre, rooms)
     kind = np.where(room == ROOM_OUTDOORS, VOXEL_OUTDOORS, VOXEL_INDOORS).astype(np.uint8)
@@ -65,7 +66,7 @@ def bake_voxels(
     kind[(room == ROOM_OUTDOORS) & solid_voxels(ray_scene, solids, centre.reshape(*shape, 3)).reshape(-1)] = VOXEL_SOLID
     fit = None if trial is None else TrialFit(trial, lattice.reshape(-1, 3), settings)
     probe, weight, blind = blend(ray_scene, centre, kind, room, placement, settings, fit)
-    source = _nearest((kind != VOXEL_SOLID) & ~(blind & (room == ROOM_OUTDOORS)), shape)
+    source, _ = nearest_lit((kind != VOXEL_SOLID) & ~(blind & (room == ROOM_OUTDOORS)), shape)
     probe, weight = probe[source], weight[source]
 
     # The fill margin was only there to be read from.
@@ -82,12 +83,12 @@ def bake_voxels(
     )
 
 
-def _lattice(index: SectorIndex, surfaces: Float64) -> tuple[Int64, tuple[int, int, int]]:
-    """Lattice indices (ny, nz, nx, 3) of a sector's voxels and the margin around them."""
-    x0, x1 = voxel_columns(index.x)
-    z0, z1 = voxel_columns(index.z)
-    y0 = int(np.floor(surfaces[0] / VOXEL_SIZE_M)) - 1
-    y1 = int(np.ceil(max(surfaces[1] + AIR_ABOVE_TOP_M, surfaces[0] + AIR_ABOVE_GROUND_M) / VOXEL_SIZE_M)) + 1
+def sector_lattice(index: SectorIndex, low_m: float, high_m: float, voxel_size_m: float) -> tuple[Int64, tuple[int, int, int]]:
+    """Lattice indices (ny, nz, nx, 3) of a sector's voxels, and of FILL_MARGIN around them, from below ``low_m`` to above ``high_m``."""
+    x0, x1 = voxel_columns(index.x, voxel_size_m)
+    z0, z1 = voxel_columns(index.z, voxel_size_m)
+    y0 = int(np.floor(low_m / voxel_size_m)) - 1
+    y1 = int(np.ceil(high_m / voxel_size_m)) + 1
     ranges = (np.arange(y0, y1), np.arange(z0 - FILL_MARGIN, z1 + FILL_MARGIN), np.arange(x0 - FILL_MARGIN, x1 + FILL_MARGIN))
     y, z, x = np.meshgrid(*ranges, indexing="ij")
     return np.stack([x, y, z], axis=-1), (len(ranges[0]), len(ranges[1]), len(ranges[2]))
@@ -144,9 +145,9 @@ def _visible(ray_scene: RayScene, centre: Float64, probes: Float64, distance: Fl
     return ~blocked.reshape(voxels, candidates)
 
 
-def _nearest(lit: Bool, shape: tuple[int, int, int]) -> Int64:
-    """For each voxel (flat order), the flat index of the nearest that is lit; its own where none is."""
+def nearest_lit(lit: Bool, shape: tuple[int, int, int]) -> tuple[Int64, Float64]:
+    """For each voxel (flat order), the flat index of the nearest that is lit, its own where none is; and how far that is [voxels]."""
     if not lit.any():
-        return np.arange(lit.size)
-    nearest = distance_transform_edt(~lit.reshape(shape), return_distances=False, return_indices=True)
-    return np.ravel_multi_index(tuple(nearest), shape).reshape(-1)
+        return np.arange(lit.size), np.zeros(lit.size)
+    distance, nearest = distance_transform_edt(~lit.reshape(shape), return_indices=True)
+    return np.ravel_multi_index(tuple(nearest), shape).reshape(-1), distance.reshape(-1)

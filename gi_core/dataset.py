@@ -1,5 +1,5 @@
-"""A baked city on disk: ``world.json``, ``sectors/*.gisec``, ``geometry/*.gigeo``, ``distant.gidist``. The only thing that bakes and
-servers share. FORMAT.md describes it."""
+"""A baked city on disk: ``world.json``, ``sectors/*.gisec``, ``geometry/*.gigeo``, ``distant.gidist``, and ``fine/*.givox`` where
+fine voxels were asked for. The only thing that bakes and servers share. FORMAT.md describes it."""
 
 import hashlib
 import json
@@ -11,12 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from gi_core import container, distant_file, geometry_file, sector_file
+from gi_core import container, distant_file, fine_file, geometry_file, sector_file
 from gi_core.arrays import Float64
 from gi_core.clock_time import time_zone
 from gi_core.constants import BASIS_SIZES, CUBE_FACES, MAX_SKY_PATCHES
 from gi_core.distant_file import DistantTexels
 from gi_core.errors import CorruptFileError, FormatVersionError, InputError, SectorMissingError
+from gi_core.fine_file import FineVoxels
 from gi_core.geometry_file import Geometry
 from gi_core.grid import SectorIndex
 from gi_core.json_fields import Fields, all_finite
@@ -28,7 +29,8 @@ from gi_core.world import LAMP_KINDS, Lamp, Location, Room
 
 FORMAT = "sectorlight-dataset"
 # Version 1 knew the ambient cube under six sky scalars alone; a bake of that kind still has it, so that older programs read it.
-VERSION, CUBE_VERSION = 2, 1
+# Version 3 has fine voxels.
+VERSION, PATCHES_VERSION, CUBE_VERSION = 3, 2, 1
 WORLD_FILE = "world.json"
 DISTANT_FILE = "distant.gidist"
 MAX_WORLD_BYTES = 1 << 28
@@ -45,6 +47,7 @@ MAX_LAMPS = 1 << 20
 class SectorFacts:
     """What world.json says of one sector: its files' bytes and digest, and what the bake counted.
 
+    fine_bytes : of the file of fine voxels; None where the bake made none
     estimated_error : median relative error that the bake expects of voxels near surfaces from interpolation alone; None where it tried
         out no light, or the sector has no such voxel
     """
@@ -61,14 +64,16 @@ class SectorFacts:
     probes_dead: int
     probes_dropped: int
     voxels_blind: int
+    fine_bytes: int | None = None
     estimated_error: float | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """The object in world.json; without an estimate there is no member for it."""
+        """The object in world.json; what there is none of has no member."""
         return {name: value for name, value in asdict(self).items() if value is not None}
 
 
-COUNTS = tuple(name for name in SectorFacts.__dataclass_fields__ if name not in ("digest", "estimated_error"))
+_OPTIONAL_FACTS = frozenset({"fine_bytes", "estimated_error"})
+COUNTS = tuple(name for name in SectorFacts.__dataclass_fields__ if name != "digest" and name not in _OPTIONAL_FACTS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,13 +117,20 @@ class WorldInfo:
         return float(np.median(found)) if found else None
 
     @property
+    def has_fine_voxels(self) -> bool:
+        """Whether volumes of cascade -1 can be had."""
+        return any(facts.fine_bytes is not None for facts in self.sectors.values())
+
+    @property
     def version(self) -> int:
         """The lowest format version of world.json that can say this."""
-        return CUBE_VERSION if (self.basis, self.sky) == ("cube", "faces") else VERSION
+        if self.has_fine_voxels:
+            return VERSION
+        return CUBE_VERSION if (self.basis, self.sky) == ("cube", "faces") else PATCHES_VERSION
 
     def to_json(self) -> dict[str, Any]:
         """The object that world.json holds."""
-        described = {"sky": self.sky} if self.version == VERSION else {}
+        described = {} if self.version == CUBE_VERSION else {"sky": self.sky}
         return described | {
             "format": FORMAT,
             "version": self.version,
@@ -152,11 +164,11 @@ class WorldInfo:
         found = record.get("version")
         if isinstance(found, bool) or not isinstance(found, int) or not 0 <= found < 1 << 32:
             raise CorruptFileError(f"{where}: expected the version to be a whole number, found a {type(found).__name__}; bake it again")
-        if found not in (CUBE_VERSION, VERSION):
+        if not CUBE_VERSION <= found <= VERSION:
             raise FormatVersionError(
-                f"{where}: dataset version {found}, this program reads versions {CUBE_VERSION} and {VERSION}; bake it again"
+                f"{where}: dataset version {found}, this program reads versions {CUBE_VERSION} to {VERSION}; bake it again"
             )
-        top = Fields(record, where, _TOP_LEVEL if found == VERSION else _TOP_LEVEL - {"sky"})
+        top = Fields(record, where, _TOP_LEVEL - {"sky"} if found == CUBE_VERSION else _TOP_LEVEL)
         basis, sky, patches = _directions(top, found)
         low, high = _corners(top)
         report = None if record["error_report"] is None else top.mapping("error_report")
@@ -177,7 +189,7 @@ class WorldInfo:
             settings=top.mapping("settings"),
             seed=top.integer("seed"),
             sun_table=_sun_table(record["sun_table"], where),
-            sectors=_sectors(top),
+            sectors=_sectors(top, found),
             rooms=tuple(_room(Fields(r, f"{where}: rooms", Room.__dataclass_fields__)) for r in top.sequence("rooms", MAX_ROOMS)),
             lamps=tuple(_lamp(Fields(r, f"{where}: lamps", Lamp.__dataclass_fields__)) for r in top.sequence("lamps", MAX_LAMPS)),
             dropped_triangles={name: top.fields("dropped_triangles").integer(name) for name in top.mapping("dropped_triangles")},
@@ -185,7 +197,6 @@ class WorldInfo:
         )
 
 
-_OPTIONAL_FACTS = frozenset({"estimated_error"})
 _TOP_LEVEL = frozenset(WorldInfo.__dataclass_fields__) | {"format", "version"}
 _SECTOR_KEY = re.compile(r"(-?\d{1,7}),(-?\d{1,7})", re.ASCII)
 
@@ -199,21 +210,24 @@ def _directions(top: Fields, version: int) -> tuple[str, str, int]:
     return top.choice("basis", tuple(BASIS_SIZES)), sky, top.integer("sky_patches", least, most)
 
 
-def _sectors(top: Fields) -> dict[SectorIndex, SectorFacts]:
+def _sectors(top: Fields, version: int) -> dict[SectorIndex, SectorFacts]:
     records = top.mapping("sectors")
     if len(records) > MAX_SECTORS:
         raise CorruptFileError(f"{top.where}: expected at most {MAX_SECTORS} sectors, found {len(records)}; bake it again")
+    optional = _OPTIONAL_FACTS if version == VERSION else _OPTIONAL_FACTS - {"fine_bytes"}
     sectors = {}
     for key, record in records.items():
         match = _SECTOR_KEY.fullmatch(key)
         # One spelling for each sector: neither 01,0 nor -0,0.
         if match is None or f"{int(match[1])},{int(match[2])}" != key or max(abs(int(n)) for n in match.groups()) > MAX_SECTOR_COORDINATE:
             raise CorruptFileError(f"{top.where}: sectors: expected keys such as 3,-2, found {key[:40]!a}; bake it again")
-        given = _OPTIONAL_FACTS & set(record) if isinstance(record, dict) else frozenset()
+        given = optional & set(record) if isinstance(record, dict) else frozenset()
         facts = Fields(record, f"{top.where}: sectors: {key}", {*COUNTS, "digest", *given})
         counted = {name: facts.integer(name) for name in COUNTS}
-        estimate = facts.number("estimated_error", 0.0) if given else None
-        sectors[SectorIndex(int(match[1]), int(match[2]))] = SectorFacts(digest=facts.text("digest"), estimated_error=estimate, **counted)
+        estimate = facts.number("estimated_error", 0.0) if "estimated_error" in given else None
+        fine = facts.integer("fine_bytes") if "fine_bytes" in given else None
+        index = SectorIndex(int(match[1]), int(match[2]))
+        sectors[index] = SectorFacts(digest=facts.text("digest"), fine_bytes=fine, estimated_error=estimate, **counted)
     return sectors
 
 
@@ -288,6 +302,11 @@ def geometry_path(root: Path, index: SectorIndex) -> Path:
     return root / "geometry" / f"{index}.gigeo"
 
 
+def fine_path(root: Path, index: SectorIndex) -> Path:
+    """Where a dataset keeps a sector's fine voxels."""
+    return root / "fine" / f"{index}.givox"
+
+
 class Dataset:
     """Read access to a dataset. Files are read when asked for; nothing is kept."""
 
@@ -355,6 +374,19 @@ class Dataset:
         if found != index or bake_id != self.world.bake_id:
             raise CorruptFileError(f"{path}: holds sector {found}{_other_bake(bake_id, self.world)}; bake it again")
         return geometry
+
+    def fine_voxels(self, sector: Sector) -> FineVoxels:
+        """A sector's fine voxels, checked against its probes. Raises as ``sector``."""
+        path = fine_path(self.path, sector.index)
+        try:
+            voxels, found, bake_id = fine_file.read(path)
+        except OSError as error:
+            raise CorruptFileError(f"{path}: {error.strerror}; bake it again") from error
+        if found != sector.index or bake_id != self.world.bake_id:
+            raise CorruptFileError(f"{path}: holds sector {found}{_other_bake(bake_id, self.world)}; bake it again")
+        if voxels.weight.any() and int(voxels.probe.max()) >= sector.probe_count:
+            raise CorruptFileError(f"{path}: expected voxels of {sector.probe_count} probes; bake it again")
+        return voxels
 
     def distant(self) -> DistantTexels:
         """Sky factors of all sectors' distant texels. Raises CorruptFileError."""

@@ -32,18 +32,18 @@ def sector_of(position: Float64) -> SectorIndex:
     return SectorIndex(int(np.floor(position[0] / SECTOR_SIZE_M)), int(np.floor(position[2] / SECTOR_SIZE_M)))
 
 
-def voxel_columns(sector_coordinate: int) -> tuple[int, int]:
+def voxel_columns(sector_coordinate: int, voxel_size_m: float = VOXEL_SIZE_M) -> tuple[int, int]:
     """First and past-the-last voxel index along x (or z) of the columns whose centres lie in a sector."""
 
     def first(edge_m: float) -> int:
-        return int(np.ceil(edge_m / VOXEL_SIZE_M - 0.5))
+        return int(np.ceil(edge_m / voxel_size_m - 0.5))
 
     return first(sector_coordinate * SECTOR_SIZE_M), first((sector_coordinate + 1) * SECTOR_SIZE_M)
 
 
-def voxel_centre(index: Int64) -> Float64:
+def voxel_centre(index: Int64, voxel_size_m: float = VOXEL_SIZE_M) -> Float64:
     """World position [m] of the centre of voxel (..., 3) int64."""
-    return (np.asarray(index, np.float64) + 0.5) * VOXEL_SIZE_M
+    return (np.asarray(index, np.float64) + 0.5) * voxel_size_m
 
 
 def volume_first_voxel(position: Float64, cascade: int = 0) -> Int64:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gi_core.arrays import AnyArray, Bool, Float32, Float64, Int64, UInt8
+from gi_core.arrays import AnyArray, Bool, Float32, Float64, Int32, Int64, UInt8
 from gi_core.basis import basis_of_size, evaluate
 from gi_core.constants import SECTOR_SIZE_M, VOLUME_SHAPE, VOXEL_INDOORS, VOXEL_OUTDOORS, VOXEL_SIZE_M, VOXEL_SOLID
 from gi_core.grid import SectorIndex, voxel_centre, voxel_columns
@@ -30,16 +30,17 @@ class Volume:
     sectors: tuple[SectorIndex, ...]
     basis: str = "cube"
     expected_error: float | None = None
+    cascade: int = 0
 
     @property
     def origin(self) -> Float64:
         """World position (3,) [m] of the centre of voxel (0, 0, 0)."""
-        return voxel_centre(self.first_voxel)
+        return voxel_centre(self.first_voxel, float(self.voxel_size[0]))
 
     @property
     def voxel_size(self) -> Float64:
         """(3,) [m]."""
-        return np.full(3, VOXEL_SIZE_M)
+        return np.full(3, VOXEL_SIZE_M * 2.0**self.cascade)
 
     @property
     def valid(self) -> float:
@@ -57,10 +58,10 @@ class SectorBox:
     size: Int64
 
 
-def plan_boxes(first_voxel: Int64) -> list[SectorBox]:
+def plan_boxes(first_voxel: Int64, voxel_size_m: float = VOXEL_SIZE_M) -> list[SectorBox]:
     """Which sectors a volume reads, and where each goes. Pure; together they cover the volume once."""
     ny, nz, nx = VOLUME_SHAPE
-    columns = [_split(int(first_voxel[0]), nx), _split(int(first_voxel[2]), nz)]
+    columns = [_split(int(first_voxel[0]), nx, voxel_size_m), _split(int(first_voxel[2]), nz, voxel_size_m)]
     boxes = []
     for sector_z, z0, z1 in columns[1]:
         for sector_x, x0, x1 in columns[0]:
@@ -71,27 +72,32 @@ def plan_boxes(first_voxel: Int64) -> list[SectorBox]:
     return boxes
 
 
-def _split(first: int, count: int) -> list[tuple[int, int, int]]:
+def _split(first: int, count: int, voxel_size_m: float) -> list[tuple[int, int, int]]:
     """Runs (sector, first voxel, past the last) along one axis."""
     runs = []
-    sector = int(np.floor(voxel_centre(np.array([first]))[0] / SECTOR_SIZE_M))
+    sector = int(np.floor(voxel_centre(np.array([first]), voxel_size_m)[0] / SECTOR_SIZE_M))
     at = first
     while at < first + count:
-        end = min(voxel_columns(sector)[1], first + count)
+        end = min(voxel_columns(sector, voxel_size_m)[1], first + count)
         runs.append((sector, at, end))
         at, sector = end, sector + 1
     return runs
 
 
 def box_record(box: SectorBox, sector: Sector) -> AnyArray:
-    """The box as fill_volume.cl reads it: (1,) layout.VOLUME_BOX."""
+    """The box as fill_volume.cl reads it from a sector's voxels: (1,) layout.VOLUME_BOX."""
+    return lattice_record(box, sector.voxel_first, sector.voxel_class.shape)
+
+
+def lattice_record(box: SectorBox, first: Int32, shape: tuple[int, ...]) -> AnyArray:
+    """The box as fill_volume.cl reads it from voxels (y, z, x) that begin at a lattice index (3,)."""
     ny, nz, nx = VOLUME_SHAPE
-    sy, sz, sx = sector.voxel_class.shape
+    sy, sz, sx = shape
     record = np.zeros(1, VOLUME_BOX.dtype)
     record["box_size"][0, :3] = box.size
     record["volume_first"][0, :3] = box.volume_first
     record["volume_size"][0, :3] = (nx, ny, nz)
-    record["sector_first"][0, :3] = box.lattice_first - sector.voxel_first
+    record["sector_first"][0, :3] = box.lattice_first - first
     record["sector_size"][0, :3] = (sx, sy, sz)
     return record
 

@@ -19,8 +19,6 @@ from server.cli_serve_options import serve
 from server.version import program_version
 
 INTERRUPTED = 130  # 128 + SIGINT, what a shell expects
-# Names of the contract that no baker makes yet.
-LATER_PRESETS = ("reference",)
 BENCH_SOURCE = "procedural:midtown?blocks=1x1&seed=1"
 
 app = typer.Typer(
@@ -101,7 +99,9 @@ def bake(
     output: Annotated[Path, typer.Option("--output", "-o", help="The dataset's folder.")],
     quality: Annotated[
         str,
-        typer.Option(help="Preset: draft, the quickest; talk, the 2016 method as its slides give it; or standard, right for more."),
+        typer.Option(
+            help="Preset: draft, the quickest; talk, the 2016 method as its slides give it; standard, right for more; reference, dearest."
+        ),
     ] = "standard",
     jobs: Annotated[int, typer.Option(min=0, max=1024, help="Processes; 0 means one per core.")] = 0,
     sectors: Annotated[str | None, typer.Option(help="X0:X1,Z0:Z1, half open; sector (i, j) covers [64 i, 64 i + 64) m.")] = None,
@@ -113,8 +113,6 @@ def bake(
     ] = None,
 ) -> None:
     """Bake a city into a dataset. Interrupted with Ctrl-C, it keeps the sectors that are finished, and the same command bakes the rest."""
-    if quality in LATER_PRESETS:
-        raise InputError(f"--quality {quality}: comes with a later version; this one bakes draft, talk and standard")
     if output.exists() and not output.is_dir():
         raise InputError(f"--output {output}: expected a folder, or a name for a new one; found a file")
     chosen = None if sectors is None else parse_sectors(sectors)

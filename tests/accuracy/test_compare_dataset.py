@@ -1,13 +1,14 @@
 """``compare`` end to end on a dataset whose light can be written down: an open plain under a uniform sky, served by a stand-in engine
 that is right, or wrong by a known factor."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from bake_jobs import compare
-from bake_jobs.compare import CUBE_STAGES, STAGES, choose_sectors, compare_dataset
+from bake_jobs.compare import CUBE_STAGES, FINE_STAGES, STAGES, choose_sectors, compare_dataset
 from gi_core.basis import from_axes
 from gi_core.constants import VOLUME_SHAPE, VOXEL_NO_SECTOR, VOXEL_OUTDOORS, VOXEL_SOLID
 from gi_core.errors import InputError
@@ -35,9 +36,11 @@ class PlainDataset:
     lamps = ()
     wall_height_m = 0.0  # of a black wall along z through the middle of every sector
     basis = "cube"
+    has_fine_voxels = False
 
     def __init__(self, sectors=PLAIN):
-        self.world = SimpleNamespace(preset="talk", basis=self.basis, location=Location(), sectors=sectors, lamps=self.lamps, bake_id="ab")
+        facts = {"basis": self.basis, "lamps": self.lamps, "has_fine_voxels": self.has_fine_voxels}
+        self.world = SimpleNamespace(preset="talk", location=Location(), sectors=sectors, bake_id="ab", **facts)
 
     def geometry(self, index):
         corners = index.origin + 64 * np.array([[0, 0, 0], [0, 0, 1], [1, 0, 1], [1, 0, 0]]) + [0, GROUND_M, 0]
@@ -79,6 +82,10 @@ def plain_engine(factor=1.0, high_factor=1.0, no_sector_from=32, solid_from=32, 
             mask[:, :, solid_from:] = VOXEL_SOLID
             mask[:, :, no_sector_from:] = VOXEL_NO_SECTOR
             return Volume(values, mask, first, (), basis)
+
+        def fine_volume(self, position, lighting):
+            coarse = self.volume(position, lighting)
+            return replace(coarse, first_voxel=volume_first_voxel(position, -1), cascade=-1)
 
     return Engine
 
@@ -124,6 +131,13 @@ def test_harmonics_are_judged_as_harmonics_and_as_the_cube_that_is_made_of_them(
     wrong = run(plain_engine(1.25, basis="sh2"), samples=256)["states"]["noon"]
     for stage, numbers in wrong.items():
         assert numbers["bias"] == pytest.approx(0 if stage.startswith("floor") else 0.25, abs=2 * CLOSE), stage
+
+
+def test_fine_voxels_are_judged_at_the_same_points(run, monkeypatch):
+    monkeypatch.setattr(PlainDataset, "has_fine_voxels", True)
+    stages = run(plain_engine(1.25), samples=256)["states"]["noon"]
+    assert tuple(stages) == STAGES + FINE_STAGES
+    assert stages["shaded_fine"] == pytest.approx(stages["shaded"], rel=1e-4)  # the plain's light is the same in voxels of any size
 
 
 def test_wrong_light_shows_everywhere_but_in_the_floor(run):

@@ -21,6 +21,11 @@ def test_standard_is_the_talk_and_its_ideas():
     assert settings_for("standard").to_json() | {"preset": ""} == ideas | {"preset": ""}
 
 
+def test_reference_is_standard_and_more_of_it():
+    more = with_knobs(settings_for("standard"), ["sky_patches=96", "probe_worth=0.001", "voxel_levels=2"]).to_json()
+    assert settings_for("reference").to_json() | {"preset": ""} == more | {"preset": ""}
+
+
 @pytest.mark.parametrize(
     ("knob", "said"),
     [
@@ -31,6 +36,8 @@ def test_standard_is_the_talk_and_its_ideas():
         ("voxel_weights=1", "expected nearest or fitted"),
         ("sky_patches=2", "expected 4 to 1024"),
         ("feedback_probes=33", "expected 1 to 32"),
+        ("voxel_levels=3", "expected 1 to 2"),
+        ("probe_worth=0", "expected 1e-05 to 10000"),
         ("feedback_probes=six", "expected a number"),
         ("grid_spacing_m=nan", "expected 0.01 to 10000"),
         ("grid_spacing_m=0", "expected 0.01 to 10000"),
@@ -47,4 +54,5 @@ def test_a_knob_that_does_nothing_is_not_part_of_a_bake():
     assert "sky_patches" not in settings_for("talk").to_json()
     assert settings_for("standard").to_json()["sky_patches"] == settings_for("standard").sky_sources
     assert settings_for("talk").sky_sources == 6
+    assert "voxel_levels" not in settings_for("standard").to_json()
     assert {settings_for(name).preset for name in PRESETS} == set(PRESETS)

@@ -126,6 +126,23 @@ def test_only_missing_and_damaged_sectors_are_baked_again(source, reference, bak
     assert files(baked) == files(reference)
 
 
+def test_fine_voxels_are_files_of_their_own_and_baked_again_when_one_is_damaged(source, tmp_path):
+    output, knobs = tmp_path / "data", ["voxel_levels=2"]
+    world = run(source, output, knobs=knobs)
+    whole = files(output)
+    for index, facts in world.sectors.items():
+        assert facts.fine_bytes == len(whole[f"fine/{index}.givox"])
+    alter(output / "fine/1_0.givox")
+    (output / "fine/0_0.givox").unlink()
+    before = times(output)
+    run(source, output, knobs=knobs)
+    after = times(output)
+    assert {name.split("/")[1].split(".")[0] for name in after if after[name] != before.get(name)} == {"0_0", "1_0"}
+    assert files(output) == whole
+    run(source, output, restart=True)
+    assert not list(output.glob("fine/*"))
+
+
 def test_another_source_bakes_everything_anew(source, baked, tmp_path):
     before = times(baked)
     other = tmp_path / "block.obj"

@@ -19,7 +19,7 @@ from bake_jobs.sector_job import SectorBaker
 from bake_jobs.solids import boxes
 from gi_core import distant_file
 from gi_core.container import write_atomic
-from gi_core.dataset import DISTANT_FILE, VERSION, SectorFacts, WorldInfo, geometry_path, sector_path, write_world
+from gi_core.dataset import DISTANT_FILE, VERSION, SectorFacts, WorldInfo, fine_path, geometry_path, sector_path, write_world
 from gi_core.grid import SectorIndex
 from gi_core.sun_table import SunTable
 from gi_core.world import Lamp, Location, Room
@@ -37,6 +37,8 @@ SETTINGS = replace(
 )
 # Version 2 of world.json: harmonics, and a dome of patches.
 SETTINGS_V2 = replace(SETTINGS, basis="sh2", sky="patches", sky_patches=8)
+# Version 3: fine voxels. The ambient cube under six sky scalars may have them too.
+SETTINGS_V3 = replace(SETTINGS, voxel_levels=2)
 
 
 def tiny_scene() -> Scene:
@@ -75,9 +77,13 @@ def write_golden(folder: Path, settings: BakeSettings = SETTINGS, scene: Scene |
         baked = baker.bake(index)
         write_atomic(geometry_path(folder, index), baked.geometry_bytes)
         write_atomic(sector_path(folder, index), baked.sector_bytes)
+        fine = baked.fine_bytes
+        if fine is not None:
+            write_atomic(fine_path(folder, index), fine)
         digest = hashlib.blake2b(baked.sector_bytes, digest_size=16).hexdigest()
         counted = {name: baked.meta[name] for name in SectorFacts.__dataclass_fields__ if name in baked.meta}
-        sectors[index] = SectorFacts(bytes=len(baked.sector_bytes), digest=digest, geometry_bytes=len(baked.geometry_bytes), **counted)
+        counted |= {"geometry_bytes": len(baked.geometry_bytes), "fine_bytes": None if fine is None else len(fine)}
+        sectors[index] = SectorFacts(bytes=len(baked.sector_bytes), digest=digest, **counted)
         sky[index] = baked.meta["distant_sky"]
     write_atomic(folder / DISTANT_FILE, distant_file.encode(distant_file.assemble(sky), BAKE_ID))
     world = WorldInfo(
@@ -104,4 +110,4 @@ def write_golden(folder: Path, settings: BakeSettings = SETTINGS, scene: Scene |
 
 if __name__ == "__main__":
     target = Path(__file__).parent / f"v{VERSION}"
-    print(target, write_golden(target, SETTINGS_V2).counts)
+    print(target, write_golden(target, SETTINGS_V3).counts)

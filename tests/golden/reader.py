@@ -145,8 +145,16 @@ def read_distant(data: bytes) -> tuple[dict[str, Any], Arrays]:
     return read_container(data, "DIST")
 
 
+def read_fine(data: bytes) -> tuple[dict[str, Any], Arrays]:
+    """meta, and the arrays under the names and shapes of gi_core.fine_file.FineVoxels (section 6)."""
+    meta, a = read_container(data, "FINE")
+    first = np.array(meta["voxel_first"])
+    weight = np.moveaxis(shares(a["voxel_weight"]), 0, 3)
+    return meta, {"first": first, "kind": a["voxel_class"], "probe": np.moveaxis(a["voxel_probe"], 0, 3), "weight": weight}
+
+
 def patches_in_rows(patches: int) -> list[int]:
-    """The dome's rows, from the zenith down (section 6)."""
+    """The dome's rows, from the zenith down (section 7)."""
     cap = math.acos(1 - 1 / patches)
     rings = max(1, round((math.pi / 2 - cap) / math.sqrt(2 * math.pi / patches)))
     edge = [math.cos(cap + (math.pi / 2 - cap) * i / rings) for i in range(rings + 1)]
@@ -160,7 +168,7 @@ def patches_in_rows(patches: int) -> list[int]:
 
 
 def patch_at(patches: int, x: float, y: float, z: float) -> int:
-    """The patch that a direction above the horizon looks at (section 6)."""
+    """The patch that a direction above the horizon looks at (section 7)."""
     before = 0
     for count in patches_in_rows(patches):
         if 1 - (before + count) / patches < y <= 1 - before / patches:

@@ -1,6 +1,6 @@
 """Datasets that users have stay readable, as FORMAT.md describes them: files of every format version, kept for good.
 
-When one of these tests fails, the format has changed: raise the version (FORMAT.md, section 7) and add tests/golden/v<version> with
+When one of these tests fails, the format has changed: raise the version (FORMAT.md, section 8) and add tests/golden/v<version> with
 make_golden.py; do not write a released version's files again.
 """
 
@@ -15,17 +15,18 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from gi_core import dataset, distant_file, geometry_file, sector_file, sky_patches
+from gi_core import dataset, distant_file, fine_file, geometry_file, sector_file, sky_patches
 from gi_core.dataset import Dataset
 from gi_core.engine import Engine
 from gi_core.sector import Sector
 
 HERE = Path(__file__).parent
 # Of world.json's version: what the dataset of each holds, decoded.
-DIGESTS = {1: "f6b367f763c6b74747559c79e7d8c404", 2: "b62685d963b990a7db7f1427109a44dd"}
+DIGESTS = {1: "f6b367f763c6b74747559c79e7d8c404", 2: "b62685d963b990a7db7f1427109a44dd", 3: "2283c2edeaed38157e15ce4f9a3bd682"}
 GOLDEN = HERE / "v1"
 SECTORS = sorted(path for version in DIGESTS for path in (HERE / f"v{version}" / "sectors").iterdir())
 GEOMETRIES = sorted(path for version in DIGESTS for path in (HERE / f"v{version}" / "geometry").iterdir())
+FINE = sorted((HERE / "v3" / "fine").iterdir())
 each_version = pytest.mark.parametrize("golden", [HERE / f"v{version}" for version in DIGESTS], ids=lambda path: path.name)
 
 
@@ -57,7 +58,9 @@ def stored_arrays(path: Path) -> set[tuple[str, str, bool, int]]:
 @each_version
 def test_the_golden_dataset_is_small_and_whole(golden):
     assert sum(path.stat().st_size for path in golden.rglob("*") if path.is_file()) < 75_000
-    for folder in ("sectors", "geometry"):
+    folders = ("sectors", "geometry", "fine") if golden.name == "v3" else ("sectors", "geometry")
+    assert {path.name for path in golden.iterdir() if path.is_dir()} == set(folders)
+    for folder in folders:
         assert sorted(path.stem for path in (golden / folder).iterdir()) == ["-1_0", "0_0"]
 
 
@@ -71,7 +74,9 @@ def test_every_golden_version_is_read_or_refused_by_name():
     versions = sorted(int(path.name[1:]) for path in HERE.glob("v*") if path.is_dir())
     assert versions == list(DIGESTS)
     assert versions[-1] == dataset.VERSION, "a new format version needs its golden dataset: run make_golden.py"
-    assert {sector_file.VERSION, geometry_file.VERSION, distant_file.VERSION} == {1}, "give tests of their v2 what these have"
+    assert {sector_file.VERSION, geometry_file.VERSION, fine_file.VERSION, distant_file.VERSION} == {1}, (
+        "give tests of their v2 what these have"
+    )
     for version in versions:
         assert json.loads((HERE / f"v{version}" / "world.json").read_bytes())["version"] == version
 
@@ -105,6 +110,17 @@ def test_geometry_read_from_format_md_alone_is_the_geometry(path):
     np.testing.assert_array_equal(geometry.emission, expected["emission"])
 
 
+@pytest.mark.parametrize("path", FINE, ids=name_of)
+def test_fine_voxels_read_from_format_md_alone_are_the_voxels(path):
+    meta, expected = reader.read_fine(path.read_bytes())
+    voxels, index, bake_id = fine_file.read(path)
+    assert (list(index), bake_id) == (meta["sector"], meta["bake_id"])
+    for name in ("first", "kind", "probe"):
+        np.testing.assert_array_equal(getattr(voxels, name), expected[name], err_msg=name)
+    np.testing.assert_allclose(voxels.weight, expected["weight"], rtol=2.5e-7)
+    assert (voxels.weight.sum(axis=3) > 0).any()
+
+
 @each_version
 def test_distant_texels_read_from_format_md_alone_are_the_texels(golden):
     meta, expected = reader.read_distant((golden / "distant.gidist").read_bytes())
@@ -124,6 +140,11 @@ def test_world_json_agrees_with_the_files_it_names(golden):
         meta, arrays = reader.read_sector(data)
         assert facts["bytes"] == len(data)
         assert facts["digest"] == hashlib.blake2b(data, digest_size=16).hexdigest()
+        assert (
+            facts.get("fine_bytes") == (golden / "fine" / f"{name}.givox").stat().st_size
+            if golden.name == "v3"
+            else "fine_bytes" not in facts
+        )
         assert facts["geometry_bytes"] == (golden / "geometry" / f"{name}.gigeo").stat().st_size
         assert meta["bake"]["bake_id"] == world["bake_id"]
         assert len(arrays["probe_position"]) == facts["probes"]
@@ -160,6 +181,9 @@ def test_what_a_version_holds_has_not_changed(version):
         for values in (*arrays, *vars(geometry).values()):
             h.update(f"{values.dtype.str}{values.shape}".encode())
             h.update(np.ascontiguousarray(values).tobytes())
+        if opened.world.has_fine_voxels:
+            for values in vars(opened.fine_voxels(sector)).values():
+                h.update(f"{values.dtype.str}{values.shape}".encode() + np.ascontiguousarray(values).tobytes())
     texels = opened.distant()
     h.update(texels.sky.tobytes() + texels.valid.tobytes())
     h.update(json.dumps(opened.world.to_json(), sort_keys=True).encode())
@@ -179,7 +203,7 @@ def test_the_golden_dataset_still_lights_a_street(golden):
 @each_version
 def test_a_dataset_made_today_is_described_by_format_md(tmp_path, golden):
     make = neighbour("make_golden")
-    world = make.write_golden(tmp_path, {"v1": make.SETTINGS, "v2": make.SETTINGS_V2}[golden.name])
+    world = make.write_golden(tmp_path, {"v1": make.SETTINGS, "v2": make.SETTINGS_V2, "v3": make.SETTINGS_V3}[golden.name])
     assert json.loads((tmp_path / "world.json").read_bytes())["version"] == int(golden.name[1:])
     opened = Dataset.open(tmp_path)
     for index in world.sectors:
@@ -192,6 +216,10 @@ def test_a_dataset_made_today_is_described_by_format_md(tmp_path, golden):
         cut = dataset.geometry_path(tmp_path, index)
         reader.read_geometry(cut.read_bytes())
         assert stored_arrays(cut) == stored_arrays(golden / "geometry" / cut.name)
+        if opened.world.has_fine_voxels:
+            fine = dataset.fine_path(tmp_path, index)
+            np.testing.assert_array_equal(reader.read_fine(fine.read_bytes())[1]["probe"], opened.fine_voxels(sector).probe)
+            assert stored_arrays(fine) == stored_arrays(golden / "fine" / fine.name)
     assert stored_arrays(tmp_path / "distant.gidist") == stored_arrays(golden / "distant.gidist")
 
 
