@@ -18,7 +18,7 @@ from bake_jobs.air import Air, beside_border, border_blocks
 from bake_jobs.choose import GAIN_STEP, Chooser, Pairs, neighbour_pairs
 from bake_jobs.config import BakeSettings
 from bake_jobs.inside import Solids
-from bake_jobs.placement import OFF_EDGES_M, Placement, asked_positions, in_boxes, room_of
+from bake_jobs.placement import OFF_EDGES_M, Placement, asked_positions, in_boxes
 from bake_jobs.rays import RayScene
 from bake_jobs.scene import ProbeHint
 from bake_jobs.trial_light import TrialLight, TrialScene
@@ -26,6 +26,7 @@ from bake_jobs.trial_states import TrialStates
 from gi_core.arrays import Bool, Float32, Float64, Int64, UInt8, UInt16
 from gi_core.constants import MAX_PROBES_PER_SECTOR, ROOM_OUTDOORS, SECTOR_SIZE_M
 from gi_core.grid import SectorIndex
+from gi_core.rooms import rooms_of
 from gi_core.sector import PROBE_IN_MARGIN, PROBE_ON_GROUND, PROBE_ON_WALL
 from gi_core.world import Room
 
@@ -109,14 +110,14 @@ def rank_probes(
     local = position[:, [0, 2]] - index.origin[[0, 2]]
     flags[((local < 0) | (local >= SECTOR_SIZE_M)).any(axis=1)] |= PROBE_IN_MARGIN
     cube = np.concatenate([trial.light(asked).cube, light.cube[chosen]])
-    return Ranking(position, flags, room_of(position, rooms), cube, len(asked) + shared, len(asked) + enough)
+    return Ranking(position, flags, rooms_of(position, rooms), cube, len(asked) + shared, len(asked) + enough)
 
 
 def _asked(index: SectorIndex, settings: BakeSettings, hints: tuple[ProbeHint, ...], rooms: tuple[Room, ...], solids: Solids) -> Float64:
     """Positions (n, 3) [m] that hints ask for, in air."""
     low, high = index.origin[[0, 2]] - settings.margin_m, index.origin[[0, 2]] + SECTOR_SIZE_M + settings.margin_m
     position = asked_positions(hints, low, high) + np.array(OFF_EDGES_M)
-    return position[~(solids.contain(position) & (room_of(position, rooms) == ROOM_OUTDOORS))]
+    return position[~(solids.contain(position) & (rooms_of(position, rooms) == ROOM_OUTDOORS))]
 
 
 def _choose(

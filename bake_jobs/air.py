@@ -9,12 +9,12 @@ import numpy as np
 
 from bake_jobs.config import BakeSettings
 from bake_jobs.inside import Solids
-from bake_jobs.placement import room_of
 from bake_jobs.rays import RayScene
 from bake_jobs.voxel_classes import FILL_MARGIN, solid_voxels
 from gi_core.arrays import Bool, Float64, Int64, UInt16
 from gi_core.constants import ROOM_OUTDOORS, SECTOR_SIZE_M, VOXEL_SIZE_M
 from gi_core.grid import SectorIndex, voxel_centre, voxel_columns
+from gi_core.rooms import rooms_of
 from gi_core.world import Room
 
 # Above the band: every fourth column, at these multiples of the band's height over the street.
@@ -61,7 +61,7 @@ def find_air(
         parts.append(high[high[:, 1] * VOXEL_SIZE_M < bounds[1, 1] + settings.band_m])
     found = np.unique(np.concatenate(parts)[:, [0, 2, 1]], axis=0)[:, [0, 2, 1]]
     centre = voxel_centre(found)
-    room = room_of(centre, rooms)
+    room = rooms_of(centre, rooms)
     column = found[:, 2] - (z0 - FILL_MARGIN), found[:, 0] - (x0 - FILL_MARGIN)
     height = centre[:, 1] - np.where(known, street, bounds[0, 1])[column]
     in_band = (found[:, 1] < lowest[column] + band) | (room != ROOM_OUTDOORS)

@@ -259,7 +259,7 @@ def _fine_light(engine: Engine, lighting: Lighting, points: SectorPoints) -> Flo
     light = np.zeros((len(points.surface), 3), np.float32)
     for number, centre in enumerate((tile + 0.5) * FINE_TILE_M):
         some = of_point.reshape(-1) == number
-        volume = engine.fine_volume(centre, lighting)
+        volume = engine.volume(centre, lighting, cascade=-1)
         normal = points.normal[some].astype(np.float32)
         light[some] = sample_volume(volume.values, volume.origin, volume.voxel_size, points.surface[some], normal)
     return light

@@ -10,7 +10,7 @@ from bake_jobs.adaptive import NEAR_SURFACE_M, Trial
 from bake_jobs.air import Air
 from bake_jobs.config import BakeSettings
 from bake_jobs.inside import Solids
-from bake_jobs.placement import Placement, room_of
+from bake_jobs.placement import Placement
 from bake_jobs.rays import RayScene
 from bake_jobs.trial_fit import TrialFit
 from bake_jobs.trial_light import TrialScene
@@ -18,8 +18,9 @@ from bake_jobs.voxel_classes import FILL_MARGIN, solid_voxels
 from bake_jobs.voxels import blend, nearest_lit, sector_lattice
 from gi_core.arrays import Bool, Float64, Int64, UInt16
 from gi_core.constants import FINE_VOXEL_SIZE_M, ROOM_OUTDOORS, VOXEL_INDOORS, VOXEL_OUTDOORS, VOXEL_SOLID
-from gi_core.fine_file import FineVoxels
 from gi_core.grid import SectorIndex, voxel_centre, voxel_columns
+from gi_core.rooms import rooms_of
+from gi_core.voxel_grid import VoxelGrid
 from gi_core.world import Room
 
 # Corners of the cell that a client's sample lies in are never farther into a wall.
@@ -40,14 +41,14 @@ def bake_fine_voxels(
     rooms: tuple[Room, ...],
     trial: Trial | None,
     trial_scene: TrialScene | None,
-) -> FineVoxels:
+) -> VoxelGrid:
     """Fine voxels of a sector. ``surfaces`` (2,) [m] are the lowest and highest surface in it; weights are fitted to trial light where
     there is any."""
     in_band = None if trial is None else trial.air.centre[trial.air.own & trial.air.in_band, 1]
     top = surfaces[0] + settings.band_m if in_band is None or not len(in_band) else float(in_band.max())
     lattice, shape = sector_lattice(index, float(surfaces[0]), min(top, float(surfaces[1]) + NEAR_SURFACE_M), FINE_VOXEL_SIZE_M)
     centre = voxel_centre(lattice.reshape(-1, 3), FINE_VOXEL_SIZE_M)
-    room = room_of(centre, rooms)
+    room = rooms_of(centre, rooms)
     kind = np.where(room == ROOM_OUTDOORS, VOXEL_OUTDOORS, VOXEL_INDOORS).astype(np.uint8)
     solid = solid_voxels(ray_scene, solids, centre.reshape(*shape, 3), FINE_VOXEL_SIZE_M).reshape(-1)
     kind[(room == ROOM_OUTDOORS) & solid] = VOXEL_SOLID
@@ -73,7 +74,7 @@ def bake_fine_voxels(
     probe[lacks], weight[lacks] = probe[source[lacks]], weight[source[lacks]]
     inner = (slice(None), slice(FILL_MARGIN, -FILL_MARGIN), slice(FILL_MARGIN, -FILL_MARGIN))
     k = settings.voxel_probes
-    return FineVoxels(
+    return VoxelGrid(
         first=lattice[0, FILL_MARGIN, FILL_MARGIN].astype(np.int32),
         kind=np.ascontiguousarray(kind.reshape(shape)[inner]),
         probe=np.ascontiguousarray(probe.reshape(*shape, k)[inner]),

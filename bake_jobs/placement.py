@@ -15,6 +15,7 @@ from bake_jobs.scene import ProbeHint
 from gi_core.arrays import Bool, Float64, UInt8, UInt16
 from gi_core.constants import MAX_PROBES_PER_SECTOR, ROOM_OUTDOORS, SECTOR_SIZE_M
 from gi_core.grid import SectorIndex
+from gi_core.rooms import rooms_of
 from gi_core.sector import PROBE_IN_MARGIN, PROBE_ON_GROUND, PROBE_ON_WALL
 from gi_core.world import Room
 
@@ -72,7 +73,7 @@ def place_probes(
 
     allowed = ~in_boxes(position, [h for h in hints if h.kind == "forbid"])
     position, flags = position[allowed], flags[allowed]
-    room = room_of(position, rooms)
+    room = rooms_of(position, rooms)
     # An authored room is air, whatever way its walls were modelled.
     dead = solids.contain(position) & (room == ROOM_OUTDOORS)
     dead_count = int((dead & _in_sector(position, index, settings.margin_m)).sum())
@@ -90,15 +91,6 @@ def place_probes(
     # Stored along a curve of place, so that neighbours in memory are neighbours in space: their factors compress and cache well.
     order = np.lexsort((position[:, 1], position[:, 0] // 8, position[:, 2] // 8))
     return Placement(position[order], flags[order], room[order], dead_count, max(0, len(in_sector) - MAX_PROBES_PER_SECTOR))
-
-
-def room_of(position: Float64, rooms: tuple[Room, ...]) -> UInt16:
-    """Number of the first room that holds each position (n, 3) [m], counting from 1; 0 outdoors."""
-    room = np.full(len(position), ROOM_OUTDOORS, np.uint16)
-    for number in range(len(rooms), 0, -1):
-        box = rooms[number - 1]
-        room[((position >= box.minimum) & (position <= box.maximum)).all(axis=1)] = number
-    return room
 
 
 def _in_sector(position: Float64, index: SectorIndex, margin_m: float) -> Bool:

@@ -16,13 +16,14 @@ from scipy.spatial import cKDTree
 from bake_jobs.adaptive import Trial
 from bake_jobs.config import BakeSettings
 from bake_jobs.inside import Solids
-from bake_jobs.placement import Placement, room_of
+from bake_jobs.placement import Placement
 from bake_jobs.rays import SURFACE_OFFSET_M, RayScene
 from bake_jobs.trial_fit import TrialFit
 from bake_jobs.voxel_classes import FILL_MARGIN, solid_voxels
 from gi_core.arrays import Bool, Float32, Float64, Int32, Int64, UInt8, UInt16
 from gi_core.constants import ROOM_OUTDOORS, VOXEL_INDOORS, VOXEL_OUTDOORS, VOXEL_SIZE_M, VOXEL_SOLID
 from gi_core.grid import SectorIndex, voxel_centre, voxel_columns
+from gi_core.rooms import rooms_of
 from gi_core.world import Room
 
 # Air is stored this far above a sector's highest surface, and at least this far above its lowest: half a volume, for a player who
@@ -60,7 +61,7 @@ def bake_voxels(
     top = max(float(surfaces[1]) + AIR_ABOVE_TOP_M, float(surfaces[0]) + AIR_ABOVE_GROUND_M)
     lattice, shape = sector_lattice(index, float(surfaces[0]), top, VOXEL_SIZE_M)
     centre = voxel_centre(lattice.reshape(-1, 3))
-    room = room_of(centre, rooms)
+    room = rooms_of(centre, rooms)
     kind = np.where(room == ROOM_OUTDOORS, VOXEL_OUTDOORS, VOXEL_INDOORS).astype(np.uint8)
     # An authored room is air, whatever way its walls were modelled.
     kind[(room == ROOM_OUTDOORS) & solid_voxels(ray_scene, solids, centre.reshape(*shape, 3)).reshape(-1)] = VOXEL_SOLID

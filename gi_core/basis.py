@@ -84,6 +84,13 @@ def evaluation_weights(basis: str, normals: AnyArray) -> AnyArray:
     return harmonics(normals, BASIS_SIZES[basis])
 
 
+def average(coefficients: AnyArray) -> AnyArray:
+    """Mean of irradiance over all directions [lx]: coefficients (B, ..., 3) -> (..., 3)."""
+    if basis_of_size(len(coefficients)) == "cube":
+        return np.asarray(coefficients.mean(axis=0))
+    return np.asarray(coefficients[0] * SH_NORM[0].astype(coefficients.dtype))  # all other harmonics' means are 0
+
+
 def feedback_weights(basis: str, normals: Float32) -> Float32:
     """``evaluation_weights`` as bounces use them: (n, 3) -> (n, B) float32."""
     weights = evaluation_weights(basis, normals)

@@ -17,7 +17,6 @@ from gi_core.clock_time import time_zone
 from gi_core.constants import BASIS_SIZES, CUBE_FACES, MAX_SKY_PATCHES
 from gi_core.distant_file import DistantTexels
 from gi_core.errors import CorruptFileError, FormatVersionError, InputError, SectorMissingError
-from gi_core.fine_file import FineVoxels
 from gi_core.geometry_file import Geometry
 from gi_core.grid import SectorIndex
 from gi_core.json_fields import Fields, all_finite
@@ -25,6 +24,7 @@ from gi_core.lights import MAX_LUMENS, check_lamp
 from gi_core.sector import Sector
 from gi_core.sky_patches import MIN_PATCHES, SKY_SCHEMES
 from gi_core.sun_table import SunTable
+from gi_core.voxel_grid import VoxelGrid
 from gi_core.world import LAMP_KINDS, Lamp, Location, Room
 
 FORMAT = "sectorlight-dataset"
@@ -375,7 +375,7 @@ class Dataset:
             raise CorruptFileError(f"{path}: holds sector {found}{_other_bake(bake_id, self.world)}; bake it again")
         return geometry
 
-    def fine_voxels(self, sector: Sector) -> FineVoxels:
+    def fine_voxels(self, sector: Sector) -> VoxelGrid:
         """A sector's fine voxels, checked against its probes. Raises as ``sector``."""
         path = fine_path(self.path, sector.index)
         try:

@@ -7,13 +7,23 @@ from dataclasses import dataclass
 import numpy as np
 import pyopencl as cl
 
-from gi_core.arrays import Float32, Float64, UInt8, UInt16
+from gi_core.arrays import Bool, Float32, Float64, UInt8, UInt16
 from gi_core.basis import convert, served_from
-from gi_core.constants import BASIS_SIZES, FINE_VOXEL_SIZE_M, SECTOR_SIZE_M, VOLUME_SHAPE, VOXEL_NO_SECTOR
+from gi_core.coarse_volume import CoarseSums, covered_sectors
+from gi_core.constants import (
+    BASIS_SIZES,
+    FINE_VOXEL_SIZE_M,
+    ROOM_OUTDOORS,
+    SECTOR_SIZE_M,
+    VOLUME_SHAPE,
+    VOXEL_INDOORS,
+    VOXEL_NO_SECTOR,
+    VOXEL_SOLID,
+)
 from gi_core.dataset import Dataset
 from gi_core.device import shared_device
 from gi_core.errors import FormatError, InputError, OutsideWorldError
-from gi_core.fine_volume import ResidentFineVoxels, interpolated
+from gi_core.fine_volume import interpolated, merge
 from gi_core.grid import SectorIndex, volume_first_voxel
 from gi_core.light_geometry import ShadowGeometry
 from gi_core.light_surfels import SurfelLights
@@ -23,11 +33,13 @@ from gi_core.lights import lamps_digest, lamps_on
 from gi_core.relight import Relighter
 from gi_core.relight_input import relight_input
 from gi_core.resident_sector import ResidentSector
+from gi_core.rooms import find_room, nearest, rooms_of
 from gi_core.sector import PROBE_IN_MARGIN
 from gi_core.settings import NEUTRAL, Settings
 from gi_core.sky_patches import face_exitance
 from gi_core.user_sky import UserSky, lighting_with_sky
-from gi_core.volume import SectorBox, Volume, box_mask, box_record, box_slices, nearest_columns, plan_boxes
+from gi_core.volume import SectorBox, Volume, box_mask, box_record, box_rooms, box_slices, nearest_columns, plan_boxes, whole_record
+from gi_core.voxel_grid import ResidentGrid, VoxelGrid
 from gi_core.world import Lamp
 
 # Device memory that queries may keep sectors in.
@@ -89,7 +101,7 @@ class Engine:
         self._residents: OrderedDict[SectorIndex, ResidentSector] = OrderedDict()
         self._shadows = ShadowGeometry(dataset.geometry, dataset.world.sectors)
         self._lights: dict[SectorIndex, SurfelLights] = {}
-        self._fine: dict[SectorIndex, ResidentFineVoxels] = {}
+        self._fine: dict[SectorIndex, ResidentGrid] = {}
         self._lit: OrderedDict[tuple[str, Settings, SectorIndex], Float32] = OrderedDict()
 
     @property
@@ -133,23 +145,29 @@ class Engine:
                 self._lit.popitem(last=False)
             return cubes
 
-    def volume(self, position: Float64, lighting: Lighting, settings: Settings = NEUTRAL, basis: str | None = None) -> Volume:
-        """The volume centred on a world position (3,) [m], under the artists' settings, in the dataset's basis or one that is poorer.
+    def volume(
+        self, position: Float64, lighting: Lighting, settings: Settings = NEUTRAL, basis: str | None = None, cascade: int = 0
+    ) -> Volume:
+        """The outdoor volume centred on a world position (3,) [m], under the artists' settings, in the dataset's basis or a poorer one.
 
-        Raises InputError for a basis that the dataset cannot be served in, OutsideWorldError, CorruptFileError.
+        cascade : 0, the talk's volume; n of 1 to 3, 2^n as wide from as many voxels; -1, half as wide, from fine voxels near surfaces
+
+        Raises InputError for a basis that the dataset cannot be served in and for a cascade -1 without fine voxels, OutsideWorldError,
+        CorruptFileError.
         """
-        own = self.dataset.world.basis
-        basis = own if basis is None else basis
-        if basis not in served_from(own):
-            raise InputError(f"basis: this dataset was baked in {own}; expected {' or '.join(served_from(own))}, found {basis}")
+        light, basis = self._light(lighting, settings), self._served(basis)
         self._expect_inside(position)
+        if cascade < 0:
+            return self._fine_volume(position, light, basis)
+        return self._volume(position, light, basis) if cascade == 0 else self._coarse_volume(position, light, basis, cascade)
+
+    def _volume(self, position: Float64, light: _Light, basis: str) -> Volume:
         first = volume_first_voxel(position)
         boxes = [box for box in plan_boxes(first) if box.index in self.dataset.world.sectors]
         if not boxes:
             raise OutsideWorldError(self._outside(position))
         values = np.zeros((BASIS_SIZES[basis], *VOLUME_SHAPE, 3), np.float32)
         mask = np.full(VOLUME_SHAPE, VOXEL_NO_SECTOR, np.uint8)
-        light = self._light(lighting, settings)
         with self._lock:
             target = self._device.allocate(values.nbytes)
             unlit = [box for box in boxes if not self._fill(box, light, target, mask, basis)]
@@ -157,38 +175,89 @@ class Engine:
         has_light = mask[0] != VOXEL_NO_SECTOR
         for box in unlit:  # it has air, but no probe: lit like columns without a sector, by the nearest that are
             has_light[box_slices(box)[1:]] = False
-        if has_light.any() and not has_light.all():
-            lack, nearest = nearest_columns(has_light)
-            values[:, :, lack[:, 0], lack[:, 1]] = values[:, :, nearest[:, 0], nearest[:, 1]]
-        report = self.dataset.world.error_report
-        expected = None if report is None else report.get("expected_error")
-        return Volume(values, mask, first, tuple(box.index for box in boxes), basis, expected)
+        _fill_columns(values, has_light)
+        return Volume(values, mask, first, tuple(box.index for box in boxes), basis, self._expected_error)
 
-    def fine_volume(self, position: Float64, lighting: Lighting, settings: Settings = NEUTRAL, basis: str | None = None) -> Volume:
-        """As ``volume``, of cascade -1: half as wide at the same number of voxels. Where a sector has no fine voxels, or a place none that
-        is near a surface, the coarse ones are interpolated. Raises InputError where the dataset has no fine voxels at all."""
-        if not self.dataset.world.has_fine_voxels:
-            raise InputError("cascade: this dataset has no fine voxels; expected 0 or more, or a bake with --quality reference")
-        coarse = self.volume(position, lighting, settings, basis)
+    def _fine_volume(self, position: Float64, light: _Light, basis: str) -> Volume:
+        world = self.dataset.world
+        if not world.has_fine_voxels:
+            raise InputError("cascade -1: this dataset has no fine voxels; expected 0 to 3, or a bake with --quality reference")
+        coarse = self._volume(position, light, basis)
         first = volume_first_voxel(position, -1)
         values, mask = interpolated(coarse, first)
-        sectors = self.dataset.world.sectors
-        boxes = [box for box in plan_boxes(first, FINE_VOXEL_SIZE_M) if box.index in sectors and sectors[box.index].fine_bytes is not None]
-        light = self._light(lighting, settings)
+        boxes = [box for box in plan_boxes(first, FINE_VOXEL_SIZE_M) if box.index in world.sectors]
         for box in boxes:
+            if world.sectors[box.index].fine_bytes is None or not world.sectors[box.index].probes:
+                continue
             filled = np.zeros_like(values)
             with self._lock:
-                cubes = self._lit_sector(box.index, light)
-                resident = self._resident(box.index)
-                if not resident.sector.probe_count:
-                    continue
-                resident.write_cubes(cubes)
-                fine = self._fine_voxels(resident)
+                resident = self._lit_resident(box.index, light)
+                if box.index not in self._fine:
+                    self._fine[box.index] = ResidentGrid(self._device, self.dataset.fine_voxels(resident.sector))
+                fine = self._fine[box.index]
                 target = self._device.allocate(values.nbytes)
-                fine.fill(box, target, resident.converted(coarse.basis), coarse.basis)
+                fine.fill(box, target, resident.converted(basis), basis)
                 self._device.read(target, filled)
-            fine.merge(box, filled, values, mask)
-        return Volume(values, mask, first, tuple(box.index for box in boxes), coarse.basis, coarse.expected_error, cascade=-1)
+            merge(fine, box, filled, values, mask)
+        return Volume(values, mask, first, tuple(box.index for box in boxes), basis, self._expected_error, cascade=-1)
+
+    def _coarse_volume(self, position: Float64, light: _Light, basis: str, cascade: int) -> Volume:
+        first = volume_first_voxel(position, cascade)
+        sectors = [index for index in covered_sectors(first, cascade) if index in self.dataset.world.sectors]
+        if not sectors:
+            raise OutsideWorldError(self._outside(position))
+        sums = CoarseSums(first, cascade, BASIS_SIZES[basis])
+        for index in sectors:
+            with self._lock:  # sector by sector: other queries wait for one, not for all
+                resident = self._lit_resident(index, light)
+                sums.add(resident.sector, self._all_voxels(resident, basis) if resident.sector.probe_count else None)
+        values, mask, has_light = sums.finish()
+        _fill_columns(values, has_light)
+        return Volume(values, mask, first, tuple(sectors), basis, self._expected_error, cascade)
+
+    def interior(
+        self,
+        position: Float64,
+        lighting: Lighting,
+        settings: Settings = NEUTRAL,
+        basis: str | None = None,
+        room: str | None = None,
+    ) -> Volume:
+        """The interior volume centred on a world position (3,) [m]: light of one room, and of no air beside it (gi_core.rooms).
+
+        room : its name or number; None takes the room that the position lies in, or all rooms where it lies in none
+
+        Raises InputError for a room that there is none of, and where the volume reaches no voxel of it; else as ``volume``.
+        """
+        rooms = self.dataset.world.rooms
+        wanted = int(rooms_of(np.asarray(position)[None], rooms)[0]) if room is None else find_room(rooms, room)
+        light, basis = self._light(lighting, settings), self._served(basis)
+        self._expect_inside(position)
+        first = volume_first_voxel(position)
+        boxes = [box for box in plan_boxes(first) if box.index in self.dataset.world.sectors]
+        if not boxes:
+            raise OutsideWorldError(self._outside(position))
+        values = np.zeros((BASIS_SIZES[basis], *VOLUME_SHAPE, 3), np.float32)
+        mask = np.full(VOLUME_SHAPE, VOXEL_NO_SECTOR, np.uint8)
+        with self._lock:
+            target = self._device.allocate(values.nbytes)
+            for box in boxes:
+                sector = self._resident(box.index).sector
+                kind, is_room = box_mask(box, sector), box_rooms(box, sector)
+                inside = is_room == wanted if wanted else is_room != ROOM_OUTDOORS
+                kind[(kind == VOXEL_INDOORS) & ~inside] = VOXEL_SOLID
+                mask[box_slices(box)] = kind
+                if (kind == VOXEL_INDOORS).any() and sector.probe_count:
+                    resident = self._lit_resident(box.index, light)
+                    grid = VoxelGrid(sector.voxel_first, sector.voxel_class, sector.voxel_probe, sector.voxel_weight)
+                    ResidentGrid(self._device, grid).fill(box, target, resident.converted(basis), basis)
+            self._device.read(target, values)
+        inside = mask == VOXEL_INDOORS
+        if not inside.any():
+            there = f"room {rooms[wanted - 1].name!r}" if wanted else "a room"
+            raise InputError(f"kind=interior: the volume around this place reaches no voxel of {there}; GET /v1/world lists rooms")
+        values = np.ascontiguousarray(values[(slice(None), *nearest(inside))])
+        return Volume(values, mask, first, tuple(box.index for box in boxes), basis, self._expected_error, room=wanted)
 
     def distant(self, lighting: Lighting) -> Distant:
         """One texel per sector of the whole world, lit by the sky alone (slide "Distant shading"). Raises CorruptFileError."""
@@ -224,15 +293,41 @@ class Engine:
 
     def _fill(self, box: SectorBox, light: _Light, target: cl.Buffer, mask: UInt8, basis: str) -> bool:
         """Fill a sector's part of a volume and its mask; whether the sector has a probe, and so any light."""
-        cubes = self._lit_sector(box.index, light)
-        resident = self._resident(box.index)
+        resident = self._lit_resident(box.index, light)
         sector = resident.sector
-        resident.write_cubes(cubes)
         if sector.probe_count:
             size = tuple(int(n) for n in box.size)
             resident.fill_volume(box_record(box, sector), size, target, resident.converted(basis), basis)
         mask[box_slices(box)] = box_mask(box, sector)
         return sector.probe_count > 0
+
+    def _all_voxels(self, resident: ResidentSector, basis: str) -> Float32:
+        """Light (B, ny, nz, nx, 3) [lx] of a sector's own voxels."""
+        ny, nz, nx = resident.sector.voxel_class.shape
+        values = np.zeros((BASIS_SIZES[basis], ny, nz, nx, 3), np.float32)
+        target = self._device.allocate(values.nbytes)
+        resident.fill_volume(whole_record(resident.sector), (nx, ny, nz), target, resident.converted(basis), basis)
+        self._device.read(target, values)
+        return values
+
+    def _lit_resident(self, index: SectorIndex, light: _Light) -> ResidentSector:
+        """A sector on the device, with its probes lit."""
+        cubes = self._lit_sector(index, light)
+        resident = self._resident(index)
+        resident.write_cubes(cubes)
+        return resident
+
+    def _served(self, basis: str | None) -> str:
+        """The basis that is meant. Raises InputError for one that the dataset cannot be served in."""
+        own = self.dataset.world.basis
+        if basis is not None and basis not in served_from(own):
+            raise InputError(f"basis: this dataset was baked in {own}; expected {' or '.join(served_from(own))}, found {basis}")
+        return own if basis is None else basis
+
+    @property
+    def _expected_error(self) -> float | None:
+        report = self.dataset.world.error_report
+        return None if report is None else report.get("expected_error")
 
     def _set_lamps(self, resident: ResidentSector, lamps: tuple[Lamp, ...]) -> None:
         index = resident.sector.index
@@ -262,12 +357,6 @@ class Engine:
     def _resident_bytes(self) -> int:
         return sum(held.nbytes for kept in (self._residents, self._fine) for held in kept.values())
 
-    def _fine_voxels(self, resident: ResidentSector) -> ResidentFineVoxels:
-        index = resident.sector.index
-        if index not in self._fine:
-            self._fine[index] = ResidentFineVoxels(self._device, self.dataset.fine_voxels(resident.sector))
-        return self._fine[index]
-
     def _expect_inside(self, position: Float64) -> None:
         low, high = self.dataset.world.bounds
         if not np.isfinite(position).all() or not low[1] - HEIGHT_MARGIN_M <= position[1] <= high[1] + HEIGHT_MARGIN_M:
@@ -280,3 +369,10 @@ class Engine:
         low, high = (", ".join(f"{v:.1f}" for v in corner) for corner in self.dataset.world.bounds)
         here = ", ".join(f"{v:g}" for v in position)
         return f"position ({here}) is outside this world; expected x, y, z [m] within ({low}) and ({high})"
+
+
+def _fill_columns(values: Float32, has_light: Bool) -> None:
+    """Light columns (32, 32) of a volume (B, 16, 32, 32, 3) that have none as the nearest that have some."""
+    if has_light.any() and not has_light.all():
+        lack, near = nearest_columns(has_light)
+        values[:, :, lack[:, 0], lack[:, 1]] = values[:, :, near[:, 0], near[:, 1]]

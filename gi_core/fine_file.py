@@ -1,42 +1,27 @@
 """A sector's fine voxels <-> bytes of a ``.givox`` file: half the talk's voxel, near surfaces, for volumes of cascade -1.
 
-Only datasets that were baked for it have such files, and only whoever asks for that cascade reads one.
+Where voxels have no weights the sector's own say enough. Only datasets that were baked for it have such files, and only whoever asks for
+that cascade reads one.
 """
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from gi_core import container, quantise
-from gi_core.arrays import AnyArray, Float32, Int32, UInt8, UInt16
+from gi_core.arrays import AnyArray
 from gi_core.constants import FINE_VOXEL_SIZE_M, MAX_PROBES_PER_SECTOR, VOXEL_INDOORS
 from gi_core.errors import CorruptFileError
 from gi_core.grid import SectorIndex, voxel_columns
 from gi_core.sector_file import MAX_BLENDED_PROBES
+from gi_core.voxel_grid import VoxelGrid
 
 KIND = "FINE"
 VERSION = 1
 _ARRAYS = frozenset({"voxel_class", "voxel_probe", "voxel_weight"})
 
 
-@dataclass(frozen=True, eq=False)
-class FineVoxels:
-    """Voxels of FINE_VOXEL_SIZE_M. K probes a voxel.
-
-    first : (3,) int32, index (x, y, z) of voxel (0, 0, 0) on the fine lattice
-    kind : (ny, nz, nx) uint8, VOXEL_SOLID, VOXEL_OUTDOORS or VOXEL_INDOORS
-    probe : (ny, nz, nx, K) uint16, the sector's own probes
-    weight : (ny, nz, nx, K) float32, sums to 1 near surfaces; to 0 where the coarse voxels say enough
-    """
-
-    first: Int32
-    kind: UInt8
-    probe: UInt16
-    weight: Float32
-
-
-def encode(index: SectorIndex, voxels: FineVoxels, bake_id: str) -> bytes:
+def encode(index: SectorIndex, voxels: VoxelGrid, bake_id: str) -> bytes:
     """Bytes of a fine voxel file. ``bake_id`` names the bake, as in the sector's other files."""
     arrays: dict[str, AnyArray] = {
         "voxel_class": voxels.kind,
@@ -47,7 +32,7 @@ def encode(index: SectorIndex, voxels: FineVoxels, bake_id: str) -> bytes:
     return container.encode(KIND, VERSION, meta, arrays, frozenset({"voxel_probe"}))
 
 
-def decode(data: bytes, where: str) -> tuple[FineVoxels, SectorIndex, str]:
+def decode(data: bytes, where: str) -> tuple[VoxelGrid, SectorIndex, str]:
     """Fine voxels, their sector and their bake's id; every count, range and index checked but against the sector's number of probes.
 
     Raises CorruptFileError or FormatVersionError.
@@ -76,9 +61,9 @@ def decode(data: bytes, where: str) -> tuple[FineVoxels, SectorIndex, str]:
         raise CorruptFileError(f"{where}: expected voxels of sector {index} with 1 to {MAX_BLENDED_PROBES} probes each; bake it again")
     shares = np.ascontiguousarray(np.moveaxis(share, 0, 3), np.float32)
     weight = shares / np.maximum(shares.sum(axis=3, keepdims=True), 1)
-    return FineVoxels(first, kind, np.ascontiguousarray(np.moveaxis(probe, 0, 3)), weight), index, bake_id
+    return VoxelGrid(first, kind, np.ascontiguousarray(np.moveaxis(probe, 0, 3)), weight), index, bake_id
 
 
-def read(path: Path) -> tuple[FineVoxels, SectorIndex, str]:
+def read(path: Path) -> tuple[VoxelGrid, SectorIndex, str]:
     """A fine voxel file from disk, as ``decode``."""
     return decode(container.read_bytes(path), str(path))

@@ -1,51 +1,12 @@
 """Volumes of cascade -1: fine voxels where the dataset has them, near surfaces; elsewhere the coarse volume, interpolated."""
 
 import numpy as np
-import pyopencl as cl
 
 from gi_core.arrays import Float32, Int64, UInt8
-from gi_core.constants import BASIS_SIZES, FINE_VOXEL_SIZE_M, VOLUME_SHAPE
-from gi_core.device import Device
-from gi_core.fine_file import FineVoxels
+from gi_core.constants import FINE_VOXEL_SIZE_M, VOLUME_SHAPE
 from gi_core.grid import voxel_centre
-from gi_core.resident_sector import VOXEL_GROUP
-from gi_core.volume import SectorBox, Volume, box_slices, lattice_record, sample_coefficients
-
-
-class ResidentFineVoxels:
-    """One sector's fine voxels on a device."""
-
-    def __init__(self, device: Device, voxels: FineVoxels) -> None:
-        self._device = device
-        self._first, self._kind = voxels.first, voxels.kind
-        self._has_light = np.asarray(voxels.weight.any(axis=3), np.bool_)
-        self._probe, self._weight = device.upload(voxels.probe), device.upload(voxels.weight)
-        self._probes = voxels.probe.shape[3]
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes on the device."""
-        return int(self._probe.size + self._weight.size)
-
-    def fill(self, box: SectorBox, target: cl.Buffer, cubes: cl.Buffer, basis: str) -> None:
-        """Enqueue this sector's part of a fine volume from its probes' light, in a basis."""
-        kernel = self._device.shared_kernel("fill_volume", BASIS_SIZE=BASIS_SIZES[basis], VOXEL_PROBES=self._probes)
-        whole = tuple(-(-int(count) // group) * group for count, group in zip(box.size, VOXEL_GROUP, strict=True))
-        record = lattice_record(box, self._first, self._kind.shape)
-        kernel.launch(whole, VOXEL_GROUP, record, self._probe, self._weight, cubes, target)
-
-    def merge(self, box: SectorBox, filled: Float32, values: Float32, mask: UInt8) -> None:
-        """Take over into a volume (B, 16, 32, 32, 3) what was filled where there are fine voxels, and into its mask what they are."""
-        (x, y, z), (nx, ny, nz) = (box.lattice_first - self._first).tolist(), box.size.tolist()
-        low, high = max(-y, 0), min(self._kind.shape[0] - y, ny)
-        if low >= high:
-            return
-        here = (slice(y + low, y + high), slice(z, z + nz), slice(x, x + nx))
-        _, rows, columns = box_slices(box)
-        there = (slice(int(box.volume_first[1]) + low, int(box.volume_first[1]) + high), rows, columns)
-        mask[there] = self._kind[here]
-        has_light = self._has_light[here]
-        values[(slice(None), *there)][:, has_light] = filled[(slice(None), *there)][:, has_light]
+from gi_core.volume import SectorBox, Volume, box_slices, sample_coefficients
+from gi_core.voxel_grid import ResidentGrid
 
 
 def interpolated(coarse: Volume, first_voxel: Int64) -> tuple[Float32, UInt8]:
@@ -56,3 +17,17 @@ def interpolated(coarse: Volume, first_voxel: Int64) -> tuple[Float32, UInt8]:
     light = sample_coefficients(coarse.values, coarse.origin, coarse.voxel_size, voxel_centre(lattice, FINE_VOXEL_SIZE_M))
     px, py, pz = (lattice // 2 - coarse.first_voxel).T
     return np.ascontiguousarray(light.transpose(1, 0, 2)).reshape(-1, ny, nz, nx, 3), coarse.mask[py, pz, px].reshape(ny, nz, nx)
+
+
+def merge(grid: ResidentGrid, box: SectorBox, filled: Float32, values: Float32, mask: UInt8) -> None:
+    """Take over into a volume (B, 16, 32, 32, 3) what was filled where there are fine voxels, and into its mask what they are."""
+    (x, y, z), (nx, ny, nz) = (box.lattice_first - grid.first).tolist(), box.size.tolist()
+    low, high = max(-y, 0), min(grid.kind.shape[0] - y, ny)
+    if low >= high:
+        return
+    here = (slice(y + low, y + high), slice(z, z + nz), slice(x, x + nx))
+    _, rows, columns = box_slices(box)
+    there = (slice(int(box.volume_first[1]) + low, int(box.volume_first[1]) + high), rows, columns)
+    mask[there] = grid.kind[here]
+    has_light = grid.has_light[here]
+    values[(slice(None), *there)][:, has_light] = filled[(slice(None), *there)][:, has_light]

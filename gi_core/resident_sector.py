@@ -22,6 +22,7 @@ from gi_core.constants import BASIS_SIZES
 from gi_core.device import Device, SharedKernel
 from gi_core.layout import BOUNCE
 from gi_core.relight_input import RelightInput
+from gi_core.rooms import outdoor_blend
 from gi_core.sector import Sector, starts
 
 Launch = Callable[..., None]
@@ -64,8 +65,7 @@ class ResidentSector:
         self.sky_starts = device.upload(sector.sky_starts)
         self.factor_code = device.upload(padded(factor_weights.device_code(sector.factor_code)))
         self.factor_scale = device.upload(padded(factor_weights.device_scale(sector.factor_code, sector.factor_scale)))
-        self.voxel_probe = device.upload(sector.voxel_probe)
-        self.voxel_weight = device.upload(sector.voxel_weight)
+        self.voxel_probe, self.voxel_weight = (device.upload(values) for values in outdoor_blend(sector))
         self.cubes = device.allocate(sector.probe_count * sector.basis_size * 16)
         self.direct = device.allocate(sector.brick_count * 16)
         self.exitance = device.allocate((sector.brick_count + sky_patches) * 16)

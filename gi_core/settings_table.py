@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from gi_core.arrays import Float64
-from gi_core.constants import VOXEL_INDOORS, VOXEL_OUTDOORS
+from gi_core.constants import VOXEL_INDOORS
 from gi_core.dataset import Dataset
 from gi_core.engine import Engine
 from gi_core.settings import NEUTRAL, Color, Settings
 from gi_core.spectrum import LUMINANCE_FROM_RGB
+from gi_core.volume import Volume
 
 DAY, NIGHT = "13:00", "23:00"
 # About what a street's shade gets by day, bluish from above and reddish from below, so that a picture tells them apart.
@@ -80,13 +81,18 @@ class Row:
 
 def settings_table(engine: Engine, position: Float64) -> list[Row]:
     """A row for each example, of the volume around a world position (3,) [m], in clear weather. Raises OutsideWorldError."""
-    rows, air = [], (VOXEL_OUTDOORS, VOXEL_INDOORS)
+    rows = []
     for example in EXAMPLES:
-        volume = engine.volume(position, engine.lighting(example.time, "clear"), example.settings)
-        illuminance = (volume.values @ LUMINANCE_FROM_RGB).mean(axis=0)
-        means = [float(illuminance[volume.mask == kind].mean()) if (volume.mask == kind).any() else np.nan for kind in air]
-        rows.append(Row(example, *means))
+        lighting = engine.lighting(example.time, "clear")
+        outdoors = engine.volume(position, lighting, example.settings)
+        has_rooms = (outdoors.mask == VOXEL_INDOORS).any()
+        indoors = engine.interior(position, lighting, example.settings) if has_rooms else None
+        rows.append(Row(example, _mean_lx(outdoors), np.nan if indoors is None else _mean_lx(indoors)))
     return rows
+
+
+def _mean_lx(volume: Volume) -> float:
+    return float((volume.values @ LUMINANCE_FROM_RGB).mean(axis=0)[volume.own].mean()) if volume.own.any() else np.nan
 
 
 def main() -> None:

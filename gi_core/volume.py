@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gi_core.arrays import AnyArray, Bool, Float32, Float64, Int32, Int64, UInt8
+from gi_core.arrays import AnyArray, Bool, Float32, Float64, Int32, Int64, UInt8, UInt16
 from gi_core.basis import basis_of_size, evaluate
-from gi_core.constants import SECTOR_SIZE_M, VOLUME_SHAPE, VOXEL_INDOORS, VOXEL_OUTDOORS, VOXEL_SIZE_M, VOXEL_SOLID
+from gi_core.constants import ROOM_OUTDOORS, SECTOR_SIZE_M, VOLUME_SHAPE, VOXEL_INDOORS, VOXEL_OUTDOORS, VOXEL_SIZE_M, VOXEL_SOLID
 from gi_core.grid import SectorIndex, voxel_centre, voxel_columns
 from gi_core.layout import VOLUME_BOX
 from gi_core.sector import Sector
@@ -22,6 +22,8 @@ class Volume:
     first_voxel : (3,) int64, world lattice index (x, y, z) of voxel (0, 0, 0)
     sectors : those that it was filled from
     expected_error : median relative error that the dataset's error report gives, or None without a report
+    cascade : its voxels are VOXEL_SIZE_M times 2 to this
+    room : of an interior volume, the room's number, or 0 for all rooms: its mask says VOXEL_INDOORS there and nowhere else; None outdoors
     """
 
     values: Float32
@@ -31,6 +33,7 @@ class Volume:
     basis: str = "cube"
     expected_error: float | None = None
     cascade: int = 0
+    room: int | None = None
 
     @property
     def origin(self) -> Float64:
@@ -47,6 +50,11 @@ class Volume:
         """Share of voxels in free air, outdoors or indoors."""
         return float(np.isin(self.mask, (VOXEL_OUTDOORS, VOXEL_INDOORS)).mean())
 
+    @property
+    def own(self) -> Bool:
+        """(16, 32, 32): voxels of the air that the volume is of; what all others hold was taken from the nearest of these."""
+        return np.asarray(self.mask == (VOXEL_OUTDOORS if self.room is None else VOXEL_INDOORS), np.bool_)
+
 
 @dataclass(frozen=True, eq=False)
 class SectorBox:
@@ -61,7 +69,7 @@ class SectorBox:
 def plan_boxes(first_voxel: Int64, voxel_size_m: float = VOXEL_SIZE_M) -> list[SectorBox]:
     """Which sectors a volume reads, and where each goes. Pure; together they cover the volume once."""
     ny, nz, nx = VOLUME_SHAPE
-    columns = [_split(int(first_voxel[0]), nx, voxel_size_m), _split(int(first_voxel[2]), nz, voxel_size_m)]
+    columns = [split_columns(int(first_voxel[0]), nx, voxel_size_m), split_columns(int(first_voxel[2]), nz, voxel_size_m)]
     boxes = []
     for sector_z, z0, z1 in columns[1]:
         for sector_x, x0, x1 in columns[0]:
@@ -72,8 +80,8 @@ def plan_boxes(first_voxel: Int64, voxel_size_m: float = VOXEL_SIZE_M) -> list[S
     return boxes
 
 
-def _split(first: int, count: int, voxel_size_m: float) -> list[tuple[int, int, int]]:
-    """Runs (sector, first voxel, past the last) along one axis."""
+def split_columns(first: int, count: int, voxel_size_m: float) -> list[tuple[int, int, int]]:
+    """Runs (sector, first voxel, past the last) of voxel columns along one axis."""
     runs = []
     sector = int(np.floor(voxel_centre(np.array([first]), voxel_size_m)[0] / SECTOR_SIZE_M))
     at = first
@@ -115,6 +123,23 @@ def box_mask(box: SectorBox, sector: Sector) -> UInt8:
     mask: UInt8 = np.take(sector.voxel_class[:, z, x], y, axis=0)
     mask[: max(int(sector.voxel_first[1] - box.lattice_first[1]), 0)] = VOXEL_SOLID
     return mask
+
+
+def box_rooms(box: SectorBox, sector: Sector) -> UInt16:
+    """Rooms (y, z, x) of a box's voxels; what lies below what a sector stores is in none."""
+    y, z, x = sector_slices(box, sector)
+    rooms: UInt16 = np.take(sector.voxel_room[:, z, x], y, axis=0)
+    rooms[: max(int(sector.voxel_first[1] - box.lattice_first[1]), 0)] = ROOM_OUTDOORS
+    return rooms
+
+
+def whole_record(sector: Sector) -> AnyArray:
+    """All of a sector's voxels, as a box of a volume that is just as large: (1,) layout.VOLUME_BOX."""
+    sy, sz, sx = sector.voxel_class.shape
+    record = np.zeros(1, VOLUME_BOX.dtype)
+    for name in ("box_size", "volume_size", "sector_size"):
+        record[name][0, :3] = (sx, sy, sz)
+    return record
 
 
 def box_slices(box: SectorBox) -> tuple[slice, slice, slice]:

@@ -15,13 +15,14 @@ from starlette.requests import HTTPConnection
 from gi_core.arrays import Float64
 from gi_core.errors import InputError
 from gi_core.json_fields import LARGEST_INTEGER
-from server.encoding import ArrayFormat, RawEncoding
+from server.encoding import ArrayFormat, RawEncoding, VolumeFormat
 from server.service import Service
 
 # Beyond this float32 metres are coarser than a voxel's position needs, and no world reaches it.
 MAX_COORDINATE_M = 1e7
 MAX_PROBE_RADIUS_M = 100.0  # at most 5 x 5 sectors, 25 000 probes
 MAX_PREVIEW_WIDTH = 1920
+MAX_CASCADE = 3  # 800 m wide: some 190 sectors
 
 Coordinate = Annotated[float, Field(ge=-MAX_COORDINATE_M, le=MAX_COORDINATE_M, allow_inf_nan=False, description="world metres")]
 
@@ -48,7 +49,7 @@ class LightingQuery(StrictQuery):
 
 
 class SkyQuery(LightingQuery):
-    format: Literal["npy"] = "npy"
+    format: Literal["npy", "exr"] = "npy"
 
 
 class PositionQuery(LightingQuery):
@@ -63,19 +64,37 @@ class PositionQuery(LightingQuery):
 
 
 class VolumeFormatQuery(StrictQuery):
-    format: ArrayFormat = "npy"
+    format: VolumeFormat = Field("npy", description="npy: float32, exact; raw: a texture's bytes; ktx2: a 3D texture file, bevy's layout")
     encoding: RawEncoding = Field(
-        "f16", description="of format=raw: RGBA halves, alpha = 1 in free air, else 0; or rgb9e5, half the bytes; lux = rgb x scale"
+        "f16",
+        description="of raw and ktx2: RGBA halves, alpha = 1 in the volume's own air, else 0; or rgb9e5, half the bytes; lux = rgb x scale",
     )
     mask: bool = Field(False, description="1: the voxels' classes (uint8) instead of light")
 
 
 class VolumeQuery(PositionQuery, VolumeFormatQuery):
-    kind: Literal["outdoor"] = "outdoor"
+    kind: Literal["outdoor", "interior", "fog"] = Field(
+        "outdoor", description="interior: light of rooms alone; fog: outdoor light averaged over all directions"
+    )
+    room: str | None = Field(
+        None, max_length=200, description="of kind=interior, a name or number of /v1/world; none: the room at x, y, z, or all rooms"
+    )
     basis: Literal["cube", "sh1", "sh2"] = Field(
         "cube", description="cube: +X -X +Y -Y +Z -Z; harmonics: 4 or 9 coefficients, where `/v1/world` says that they can be had"
     )
-    cascade: int = Field(0, ge=0, le=0, description="0: 32 x 16 x 32 voxels of 3.125 m")
+    cascade: int = Field(
+        0, ge=-1, le=MAX_CASCADE, description="0: 32 x 16 x 32 voxels of 3.125 m; n doubles their size n times; -1 halves it, where baked"
+    )
+
+    @model_validator(mode="after")
+    def _fits_its_kind(self) -> "VolumeQuery":
+        if self.kind != "interior" and self.room is not None:
+            raise ValueError("room with kind=interior only")
+        if self.kind == "interior" and self.cascade != 0:
+            raise ValueError("cascade=0 of kind=interior")
+        if self.kind == "fog" and self.basis != "cube":
+            raise ValueError("no basis of kind=fog, which has no direction")
+        return self
 
 
 class PlayerVolumeQuery(VolumeFormatQuery):

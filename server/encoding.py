@@ -1,4 +1,4 @@
-"""Arrays as bytes: ``npy`` is exact, ``raw`` is for GPUs."""
+"""Arrays as bytes: ``npy`` is exact, ``raw`` is for GPUs, ``ktx2`` (server/ktx2.py) for those that want a file."""
 
 import io
 import json
@@ -10,17 +10,18 @@ import numpy as np
 from gi_core.arrays import AnyArray, Float32, UInt8, UInt16
 
 ArrayFormat = Literal["npy", "raw"]
+VolumeFormat = Literal["npy", "raw", "ktx2"]
 RawEncoding = Literal["f16", "rgb9e5"]
 
 # Changes whenever the bytes of a reply change for the same data; part of every ETag.
-REPLY_VERSION = 3
+REPLY_VERSION = 4
 
 HALF_MAX = 65504.0
 SHARED_EXPONENT_MAX = 65408.0  # 511 / 512 x 2^16
 _MANTISSA_BITS, _EXPONENT_BIAS = 9, 15
 _HALF_ONE = np.uint16(0x3C00)
 _LEAST_NORMAL_HALF = (127 - 14) << 23  # bits of the float32 2^-14
-MEDIA_TYPE: dict[ArrayFormat, str] = {"npy": "application/x-npy", "raw": "application/octet-stream"}
+MEDIA_TYPE: dict[VolumeFormat, str] = {"npy": "application/x-npy", "raw": "application/octet-stream", "ktx2": "image/ktx2"}
 
 
 def npy(array: AnyArray) -> bytes:

@@ -115,6 +115,8 @@ class WorldReply(BaseModel):
     voxel_size_m: float
     volume_shape: tuple[int, int, int] = Field(description="y, z, x")
     bases: list[str] = Field(description="what `basis` of a volume may be: the bake's, those poorer than it, and cube, the default")
+    kinds: list[str] = Field(description="what `kind` of a volume may be: outdoor, fog, and where there are rooms interior")
+    cascades: list[int] = Field(description="what `cascade` of a volume may be: -1 where fine voxels were baked")
     rooms: list[RoomReply]
     limits: LimitsReply
     dataset: dict[str, Any] = Field(description="digest, preset, basis, settings, counts and error report of the bake")

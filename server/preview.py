@@ -1,7 +1,7 @@
 """A picture of the lit city, drawn the way a client draws: direct light by shadow rays, indirect light from served volumes only.
 
     camera rays -> surface -> direct sun, moon and lamps (shadow rays)
-                           -> indirect: the volume that covers the pixel, a quarter voxel off the surface
+                           -> indirect: the volume that covers the pixel, a quarter voxel off the surface; of its room, indoors
                            -> albedo, whitened where snow lies
                 -> sky radiance, or a plain ground beyond the world's edge
                 -> fog before both, then the lamps themselves
@@ -17,12 +17,14 @@ import numpy as np
 from gi_core.arrays import Float32, Float64, Int32, Int64
 from gi_core.constants import VOLUME_SHAPE, VOXEL_SIZE_M
 from gi_core.engine import Engine
+from gi_core.errors import InputError
 from gi_core.lighting import Lighting
 from gi_core.lights import lamps_on
+from gi_core.rooms import rooms_of
 from gi_core.settings import NEUTRAL, Settings
 from gi_core.snow import snow_attribute, whitened
 from gi_core.volume import Volume, sample_volume
-from gi_core.world import Lamp
+from gi_core.world import Lamp, Room
 from server.camera import Camera
 from server.preview_air import background, plain_distance, through_fog
 from server.preview_lamps import draw_lamps, lamp_irradiance
@@ -30,7 +32,8 @@ from server.preview_scene import PreviewScene
 from server.raycast import RayCaster
 
 Indirect = Literal["on", "off", "split"]
-VolumeAt = Callable[[Float64], Volume]
+# The served volume around a place, of the room that a number says; 0 is outdoors.
+VolumeAt = Callable[[Float64, int], Volume]
 
 STRAIGHT_UP = np.array([0.0, 1.0, 0.0])
 SAMPLE_OFFSET_M = VOXEL_SIZE_M / 4
@@ -48,16 +51,26 @@ def city_radiance(
     """``render`` with an engine's lamps and volumes, under the artists' settings. Raises CorruptFileError."""
     low, high = engine.dataset.world.bounds
 
-    def volume_at(position: Float64) -> Volume:
+    def volume_at(position: Float64, room: int) -> Volume:
         # A tile's centre may lie beyond the world's edge though its pixels do not.
-        return engine.volume(np.clip(position, low, high), lighting, settings)
+        inside = np.clip(position, low, high)
+        try:
+            return engine.interior(inside, lighting, settings, room=str(room)) if room else engine.volume(inside, lighting, settings)
+        except InputError:  # a closet between voxels, of which no light is known
+            return engine.volume(inside, lighting, settings)
 
     lamps = settings.brightened(lamps_on(engine.lamps, lighting))
-    return render(camera, scene, settings.light(lighting), lamps, volume_at, indirect)
+    return render(camera, scene, settings.light(lighting), lamps, volume_at, indirect, engine.dataset.world.rooms)
 
 
 def render(
-    camera: Camera, scene: PreviewScene, lighting: Lighting, lamps: Sequence[Lamp], volume_at: VolumeAt, indirect: Indirect
+    camera: Camera,
+    scene: PreviewScene,
+    lighting: Lighting,
+    lamps: Sequence[Lamp],
+    volume_at: VolumeAt,
+    indirect: Indirect,
+    rooms: tuple[Room, ...] = (),
 ) -> Float32:
     """Radiance (height, width, 3) float32 [cd m^-2]. ``lamps`` are those that are on; ``volume_at`` gives the served volume around a
     world position (3,) [m]."""
@@ -73,7 +86,7 @@ def render(
     irradiance = direct_irradiance(scene.rays, lighting, lamps, position, normal)
     wanted = indirect_pixels(hit, camera.width, indirect)
     if len(wanted):
-        irradiance[wanted] += indirect_irradiance(position[wanted], normal[wanted], volume_at)
+        irradiance[wanted] += indirect_irradiance(position[wanted], normal[wanted], volume_at, rooms)
     albedo = seen_albedo(scene, lighting, position, normal, triangle)
     radiance[hit] = albedo / np.pi * irradiance + scene.emission[triangle]
     radiance[hit] = through_fog(radiance[hit], surface.distance[hit], lighting)
@@ -109,17 +122,21 @@ def indirect_pixels(pixel: Int64, width: int, indirect: Indirect) -> Int64:
     return np.arange(len(pixel) if indirect == "on" else 0)
 
 
-def indirect_irradiance(position: Float64, normal: Float32, volume_at: VolumeAt) -> Float64:
+def indirect_irradiance(position: Float64, normal: Float32, volume_at: VolumeAt, rooms: tuple[Room, ...] = ()) -> Float64:
     """Irradiance (n, 3) [lx] at surface points (n, 3) [m] with normals (n, 3), read from as many volumes as they need."""
     result = np.zeros((len(position), 3))
-    # sample_volume reads this far off the surface, which may be the next volume's.
-    centres, which = plan_volumes(position + SAMPLE_OFFSET_M * normal)
-    for i, centre in enumerate(centres):
-        volume = volume_at(centre)
-        members = np.flatnonzero(which == i)
-        for start in range(0, len(members), SAMPLES_AT_ONCE):
-            some = members[start : start + SAMPLES_AT_ONCE]
-            result[some] = sample_volume(volume.values, volume.origin, volume.voxel_size, position[some], normal[some])
+    # sample_volume reads this far off the surface, which may be the next volume's, or a room's.
+    at = position + SAMPLE_OFFSET_M * normal
+    room = rooms_of(at, rooms)
+    for number in np.unique(room):
+        there = np.flatnonzero(room == number)
+        centres, which = plan_volumes(at[there])
+        for i, centre in enumerate(centres):
+            volume = volume_at(centre, int(number))
+            members = there[which == i]
+            for start in range(0, len(members), SAMPLES_AT_ONCE):
+                some = members[start : start + SAMPLES_AT_ONCE]
+                result[some] = sample_volume(volume.values, volume.origin, volume.voxel_size, position[some], normal[some])
     return result
 
 

@@ -7,6 +7,7 @@ from fastapi import APIRouter, Query, Request, Response
 from server.caching import Body, conditional, strong_etag
 from server.dependencies import LightingQuery, ServiceDep, SkyQuery
 from server.encoding import MEDIA_TYPE, REPLY_VERSION, npy
+from server.exr import exr
 from server.models import LightingReply
 
 router = APIRouter(prefix="/v1", tags=["light"])
@@ -20,12 +21,22 @@ def lighting(request: Request, service: ServiceDep, query: Annotated[LightingQue
     return conditional(request, etag, lambda: Body(LightingReply.of(light).model_dump_json().encode(), "application/json"))
 
 
-@router.get("/sky", response_class=Response, responses={200: {"content": {MEDIA_TYPE["npy"]: {}}}})
+EXR_MEDIA_TYPE = "image/x-exr"
+
+
+@router.get("/sky", response_class=Response, responses={200: {"content": {MEDIA_TYPE["npy"]: {}, EXR_MEDIA_TYPE: {}}}})
 def sky(request: Request, service: ServiceDep, query: Annotated[SkyQuery, Query()]) -> Response:
     """Sky radiance, float32 (64, 128, 3) in cd/m2 per channel, equirectangular, no sun disc, zero below the horizon.
 
-    Row i, column j looks along (sin t cos p, cos t, sin t sin p), t = pi (i + 0.5) / 64, p = 2 pi (j + 0.5) / 128.
+    Row i, column j looks along (sin t cos p, cos t, sin t sin p), t = pi (i + 0.5) / 64, p = 2 pi (j + 0.5) / 128. `exr`: the same as an
+    OpenEXR picture, channels R, G, B.
     """
     light = service.lighting(query.time, query.weather)
     etag = strong_etag("sky", REPLY_VERSION, light.digest, query.format)
-    return conditional(request, etag, lambda: Body(npy(light.sky_radiance), MEDIA_TYPE["npy"]))
+
+    def compute() -> Body:
+        if query.format == "exr":
+            return Body(exr(light.sky_radiance), EXR_MEDIA_TYPE)
+        return Body(npy(light.sky_radiance), MEDIA_TYPE["npy"])
+
+    return conditional(request, etag, compute)

@@ -3,11 +3,16 @@
 from collections.abc import Mapping
 from typing import Annotated, Any
 
+import numpy as np
 from fastapi import APIRouter, Query, Request, Response
 
-from gi_core.constants import VOXEL_INDOORS, VOXEL_OUTDOORS
+from gi_core.arrays import AnyArray, Float32
+from gi_core.basis import average
+from gi_core.constants import CUBE_FACES
 from gi_core.errors import InputError
 from gi_core.volume import Volume
+from gi_core.world import Room
+from server import ktx2
 from server.caching import Body, conditional, strong_etag
 from server.dependencies import ServiceDep, VolumeFormatQuery, VolumeQuery
 from server.encoding import (
@@ -30,10 +35,18 @@ def volume(request: Request, service: ServiceDep, query: Annotated[VolumeQuery, 
     """Irradiance [lx] in the 32 x 16 x 32 voxels around a point, snapped to the world's lattice.
 
     `npy`: float32 (B, 16, 32, 32, 3) = coefficient, y, z, x, channel.
-    `raw`: little-endian halves (B, 16, 32, 32, 4); lux = rgb x scale; alpha is 1 in free air, else 0. With `encoding=rgb9e5`, of the cube
-    alone: words (6, 16, 32, 32) of three nine-bit mantissas and their exponent, a GPU's E5B9G9R9; lux = rgb x scale.
+    `raw`: little-endian halves (B, 16, 32, 32, 4); lux = rgb x scale; alpha is 1 in the volume's own air, else 0. With `encoding=rgb9e5`,
+    of the cube alone: words (6, 16, 32, 32) of three nine-bit mantissas and their exponent, a GPU's E5B9G9R9; lux = rgb x scale.
+    `ktx2`: the same texels of the cube as one 3D texture, 32 wide, 2 x 16 high (negative faces, then positive), 3 x 32 deep (X, Y, Z):
+    bevy's irradiance volume. The file's key `Gi-Volume` repeats the header.
     `basis=cube`: B = 6 faces +X -X +Y -Y +Z -Z. `sh1`, `sh2`: B = 4, 9 of real spherical harmonics in the order 1, y, z, x, xy, yz,
     3z^2-1, xz, x^2-y^2, of either sign; irradiance along a normal is their sum, each times its harmonic there.
+
+    `kind=outdoor`: no light of rooms; a voxel in one holds what the nearest one outdoors has. `kind=interior`: of a room alone; every other
+    voxel holds what the nearest inside has, and `rooms` in the header places its box: inside it sample this volume, else the outdoor
+    one. `kind=fog`: outdoor light averaged over directions, (16, 32, 32, 3).
+    `cascade=1..3`: voxels of twice, four and eight times the size, means of those inside them; `-1`: of half the size, where `/v1/world`
+    says so. Each cascade covers the middle of the next: blend from one to the other over the last voxels of the smaller.
     `mask=1`: uint8 (16, 32, 32), 0 solid, 1 outdoors, 2 indoors, 3 no sector there. The header `Gi-Volume` places it in the world.
     """
     laps = Laps()
@@ -43,38 +56,64 @@ def volume(request: Request, service: ServiceDep, query: Annotated[VolumeQuery, 
 
     def compute() -> Body:
         with laps.lap("relight"):
-            found = service.engine.volume(query.position, light, basis=query.basis)
+            if query.kind == "interior":
+                found = service.engine.interior(query.position, light, basis=query.basis, room=query.room)
+            else:
+                basis = None if query.kind == "fog" else query.basis
+                found = service.engine.volume(query.position, light, basis=basis, cascade=query.cascade)
         with laps.lap("encode"):
-            return mask_body(found, query) if query.mask else light_body(found, query)
+            rooms = service.dataset.world.rooms
+            return mask_body(found, query, rooms) if query.mask else light_body(found, query, rooms, is_fog=query.kind == "fog")
 
     return conditional(request, etag, compute, laps=laps)
 
 
-def light_body(found: Volume, query: VolumeFormatQuery) -> Body:
-    """The light of a volume in the format that was asked for."""
-    values = found.values
+def light_body(found: Volume, query: VolumeFormatQuery, rooms: tuple[Room, ...] = (), is_fog: bool = False) -> Body:
+    """The light of a volume in the format that was asked for; of fog its average over directions."""
+    basis = "average" if is_fog else found.basis
+    values: Float32 = average(found.values) if is_fog else found.values
+
+    def facts(shape: tuple[int, ...], dtype: str, scale: float) -> dict[str, Any]:
+        return volume_facts(found, shape, dtype, scale, rooms) | {"basis": basis}
+
     if query.format == "npy":
-        return _body(npy(values), query, volume_facts(found, values.shape, "float32", 1.0))
+        return _body(npy(values), query, facts(values.shape, "float32", 1.0))
+    if basis not in ("cube", "average"):
+        if query.encoding == "rgb9e5":
+            raise InputError(f"encoding: rgb9e5 has no sign; expected basis=cube or encoding=f16, found basis={basis}")
+        if query.format == "ktx2":
+            raise InputError(f"format: ktx2 holds the cube's six faces; expected basis=cube, or another format, found basis={basis}")
+    own = found.own.astype("u1")
+    if query.format == "ktx2":
+        values, own = _as_texture(values), _as_texture(own if is_fog else np.broadcast_to(own, (6, *own.shape)))
     if query.encoding == "rgb9e5":
-        if found.basis != "cube":
-            raise InputError(f"encoding: rgb9e5 has no sign; expected basis=cube or encoding=f16, found basis={found.basis}")
-        scale = shared_exponent_scale(values)
-        return _body(shared_exponent_texels(values, scale), query, volume_facts(found, values.shape[:-1], "rgb9e5", scale))
-    scale = half_scale(values)
-    free = ((found.mask == VOXEL_OUTDOORS) | (found.mask == VOXEL_INDOORS)).astype("u1")
-    texels = half_texels(values, scale, free)
-    return _body(texels, query, volume_facts(found, (*values.shape[:-1], 4), "float16", scale))
+        scale, shape, dtype = shared_exponent_scale(values), values.shape[:-1], "rgb9e5"
+        texels = shared_exponent_texels(values, scale)
+    else:
+        scale, shape, dtype = half_scale(values), (*values.shape[:-1], 4), "float16"
+        texels = half_texels(values, scale, own)
+    described = facts(shape, dtype, scale)
+    if query.format == "ktx2":
+        texels = _file(texels, shape, ktx2.SHARED_EXPONENT if query.encoding == "rgb9e5" else ktx2.HALF_RGBA, described)
+    return _body(texels, query, described)
 
 
-def mask_body(found: Volume, query: VolumeFormatQuery) -> Body:
+def mask_body(found: Volume, query: VolumeFormatQuery, rooms: tuple[Room, ...] = ()) -> Body:
     """The classes of a volume's voxels."""
-    content = npy(found.mask) if query.format == "npy" else found.mask.tobytes()
-    return _body(content, query, volume_facts(found, found.mask.shape, "uint8", 1.0))
+    classes = np.swapaxes(found.mask, 0, 1) if query.format == "ktx2" else found.mask
+    described = volume_facts(found, classes.shape, "uint8", 1.0, rooms)
+    if query.format == "npy":
+        content = npy(classes)
+    else:
+        content = classes.tobytes()
+        if query.format == "ktx2":
+            content = _file(content, classes.shape, ktx2.BYTE, described)
+    return _body(content, query, described)
 
 
-def volume_facts(found: Volume, shape: tuple[int, ...], dtype: str, scale: float) -> dict[str, Any]:
+def volume_facts(found: Volume, shape: tuple[int, ...], dtype: str, scale: float, rooms: tuple[Room, ...]) -> dict[str, Any]:
     """What ``Gi-Volume`` says. ``origin`` is the centre of voxel (0, 0, 0) in world metres."""
-    return {
+    facts = {
         "origin": [float(v) for v in found.origin],
         "voxel_size": [float(v) for v in found.voxel_size],
         "shape": list(shape),
@@ -85,7 +124,22 @@ def volume_facts(found: Volume, shape: tuple[int, ...], dtype: str, scale: float
         "sectors": [[index.x, index.z] for index in found.sectors],
         "valid": round(found.valid, 6),
         "expected_error": found.expected_error,
+        "cascade": found.cascade,
     }
+    if found.room is not None:
+        chosen = enumerate(rooms, 1) if found.room == 0 else [(found.room, rooms[found.room - 1])]
+        facts["rooms"] = [{"number": n, "name": room.name, "minimum": room.minimum, "maximum": room.maximum} for n, room in chosen]
+    return facts
+
+
+def _as_texture(values: AnyArray) -> AnyArray:
+    """Six faces (6, y, z, x, ...) stacked into one texture, or one field (y, z, x, ...) as one: (z, y, x, ...)."""
+    return ktx2.stacked_faces(values) if len(values) == len(CUBE_FACES) else np.swapaxes(values, 0, 1)
+
+
+def _file(texels: bytes, shape: tuple[int, ...], kind: ktx2.TexelFormat, facts: Mapping[str, Any]) -> bytes:
+    depth, height, width = shape[:3]
+    return ktx2.texture_file(texels, (depth, height, width), kind, {"Gi-Volume": header_json(facts)})
 
 
 def _body(content: bytes, query: VolumeFormatQuery, facts: Mapping[str, Any]) -> Body:

@@ -9,7 +9,7 @@ from gi_core.constants import MAX_PROBES_PER_SECTOR, SECTOR_SIZE_M, VOLUME_SHAPE
 from gi_core.dataset import WorldInfo
 from gi_core.weather import WEATHER_RANGES, weather_presets
 from server.caching import Body, conditional, strong_etag
-from server.dependencies import MAX_PREVIEW_WIDTH, MAX_PROBE_RADIUS_M, NoQuery, ServiceDep
+from server.dependencies import MAX_CASCADE, MAX_PREVIEW_WIDTH, MAX_PROBE_RADIUS_M, NoQuery, ServiceDep
 from server.encoding import REPLY_VERSION
 from server.models import BoundsReply, LimitsReply, LocationReply, RoomReply, SectorGridReply, WorldReply, vector3
 
@@ -49,6 +49,8 @@ def world_reply(info: WorldInfo, digest: str) -> WorldReply:
         voxel_size_m=VOXEL_SIZE_M,
         volume_shape=VOLUME_SHAPE,
         bases=list(served_from(info.basis)),
+        kinds=["outdoor", "fog", *(["interior"] if info.rooms else [])],
+        cascades=list(range(-1 if info.has_fine_voxels else 0, MAX_CASCADE + 1)),
         rooms=[RoomReply(name=room.name, minimum=room.minimum, maximum=room.maximum) for room in info.rooms],
         limits=LimitsReply(probe_radius_m=MAX_PROBE_RADIUS_M, preview_width=MAX_PREVIEW_WIDTH, probes_per_sector=MAX_PROBES_PER_SECTOR),
         dataset={

@@ -1,7 +1,6 @@
 """``compare`` end to end on a dataset whose light can be written down: an open plain under a uniform sky, served by a stand-in engine
 that is right, or wrong by a known factor."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -71,8 +70,8 @@ def plain_engine(factor=1.0, high_factor=1.0, no_sector_from=32, solid_from=32, 
         def lit_sector(self, index, lighting):
             return factor * np.repeat((from_axes(basis) @ plain_cube())[None], 4, axis=0)
 
-        def volume(self, position, lighting, basis=basis):
-            first = volume_first_voxel(position)
+        def volume(self, position, lighting, basis=basis, cascade=0):
+            first = volume_first_voxel(position, cascade)
             light = from_axes(basis) @ plain_cube()
             values = factor * np.broadcast_to(light[:, None, None, None], (len(light), *VOLUME_SHAPE, 3)).astype(np.float32)
             mask = np.full(VOLUME_SHAPE, VOXEL_OUTDOORS, np.uint8)
@@ -81,11 +80,7 @@ def plain_engine(factor=1.0, high_factor=1.0, no_sector_from=32, solid_from=32, 
             mask[heights < GROUND_M] = VOXEL_SOLID
             mask[:, :, solid_from:] = VOXEL_SOLID
             mask[:, :, no_sector_from:] = VOXEL_NO_SECTOR
-            return Volume(values, mask, first, (), basis)
-
-        def fine_volume(self, position, lighting):
-            coarse = self.volume(position, lighting)
-            return replace(coarse, first_voxel=volume_first_voxel(position, -1), cascade=-1)
+            return Volume(values, mask, first, (), basis, cascade=cascade)
 
     return Engine
 

@@ -7,11 +7,12 @@ import pytest
 
 from bake_jobs.config import settings_for
 from bake_jobs.inside import Solids
-from bake_jobs.placement import CLEARANCE_M, Placement, place_probes, room_of
+from bake_jobs.placement import CLEARANCE_M, Placement, place_probes
 from bake_jobs.rays import RayScene
 from bake_jobs.scene import ProbeHint
 from gi_core.constants import MAX_PROBES_PER_SECTOR
 from gi_core.grid import SectorIndex
+from gi_core.rooms import rooms_of
 from gi_core.sector import PROBE_IN_MARGIN, PROBE_ON_GROUND, PROBE_ON_WALL
 from gi_core.world import Room
 
@@ -206,7 +207,7 @@ def test_an_added_probe_inside_a_house_is_refused_unless_it_is_a_room(build):
 def test_the_first_room_that_holds_a_point_names_it():
     rooms = (Room("a", (0.0, 0.0, 0.0), (4.0, 4.0, 4.0)), Room("b", (2.0, 0.0, 0.0), (8.0, 4.0, 4.0)))
     points = np.array([[1.0, 1, 1], [3, 1, 1], [5, 1, 1], [9, 1, 1], [4, 4, 4]])
-    assert room_of(points, rooms).tolist() == [1, 1, 2, 0, 1]
+    assert rooms_of(points, rooms).tolist() == [1, 1, 2, 0, 1]
 
 
 def test_at_most_a_thousand_probes_and_those_of_the_sector_come_first(build):

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from bake_jobs.placement import room_of
 from bake_jobs.rays import SURFACE_OFFSET_M, RayScene
 from gi_core.constants import ROOM_OUTDOORS, VOXEL_INDOORS, VOXEL_OUTDOORS, VOXEL_SIZE_M, VOXEL_SOLID
 from gi_core.grid import SectorIndex, voxel_columns
 from gi_core.relight_twin import sun_bits
+from gi_core.rooms import rooms_of
 from gi_core.world import Room
 
 HALL = Room("hall", (20.0, 0.0, 20.0), (44.0, 8.0, 44.0))
@@ -205,4 +205,4 @@ def test_snow_lies_on_what_is_flat_and_open(build, bake_arrays):
 
 def test_room_numbers_of_voxels_come_from_their_centres(hall):
     scene, sector, _ = hall
-    np.testing.assert_array_equal(sector.voxel_room.reshape(-1), room_of(centres(sector).reshape(-1, 3), scene.rooms))
+    np.testing.assert_array_equal(sector.voxel_room.reshape(-1), rooms_of(centres(sector).reshape(-1, 3), scene.rooms))

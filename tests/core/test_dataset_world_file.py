@@ -49,9 +49,9 @@ def test_what_is_written_is_what_is_read(tmp_path):
     assert world.counts["probes"] == sum(facts["probes"] for facts in RECORD["sectors"].values())
 
 
-@pytest.mark.parametrize("version", [0, 3, 999])
+@pytest.mark.parametrize("version", [0, 4, 999])
 def test_another_version_is_named_and_says_what_to_do(version):
-    with pytest.raises(FormatVersionError, match=rf"city/world\.json: dataset version {version}, .* versions 1 and 2; bake it again"):
+    with pytest.raises(FormatVersionError, match=rf"city/world\.json: dataset version {version}, .* versions 1 to 3; bake it again"):
         read(at("version", to=version))
 
 

@@ -38,7 +38,7 @@ def centres(volume) -> np.ndarray:
 
 
 def test_it_is_half_as_wide_and_on_a_lattice_of_its_own(engine):
-    volume = engine.fine_volume(STREET, engine.lighting("12:00", "clear"))
+    volume = engine.volume(STREET, engine.lighting("12:00", "clear"), cascade=-1)
     assert volume.values.shape == (6, *VOLUME_SHAPE, 3)
     np.testing.assert_array_equal(volume.voxel_size, [VOXEL_SIZE_M / 2] * 3)
     middle = volume.origin + volume.voxel_size * (np.array([32, 16, 32]) - 1) / 2
@@ -50,7 +50,7 @@ def test_it_is_half_as_wide_and_on_a_lattice_of_its_own(engine):
 
 def test_where_there_are_no_fine_voxels_the_coarse_are_interpolated(engine):
     light = engine.lighting("12:00", "clear")
-    fine, coarse = engine.fine_volume(STREET, light), engine.volume(STREET, light)
+    fine, coarse = engine.volume(STREET, light, cascade=-1), engine.volume(STREET, light)
     expected = sample_coefficients(coarse.values, coarse.origin, coarse.voxel_size, centres(fine))
     found = fine.values.reshape(6, -1, 3).transpose(1, 0, 2)
     same = np.abs(found - expected).max(axis=(1, 2)) <= 1e-3 * expected.max()
@@ -61,7 +61,7 @@ def test_where_there_are_no_fine_voxels_the_coarse_are_interpolated(engine):
 
 def test_fine_voxels_are_their_probes_blended(engine):
     light = engine.lighting("12:00", "clear")
-    volume = engine.fine_volume(STREET, light)
+    volume = engine.volume(STREET, light, cascade=-1)
     sector = engine.dataset.sector(HERE)
     voxels = engine.dataset.fine_voxels(sector)
     cubes = engine.lit_sector(HERE, light)
@@ -79,13 +79,13 @@ def test_fine_voxels_are_their_probes_blended(engine):
 
 def test_it_is_served_in_poorer_bases_too(engine):
     with pytest.raises(InputError, match="basis"):
-        engine.fine_volume(STREET, engine.lighting("12:00", "clear"), basis="sh2")
+        engine.volume(STREET, engine.lighting("12:00", "clear"), basis="sh2", cascade=-1)
 
 
 def test_a_dataset_without_fine_voxels_refuses():
     plain = Engine(Dataset.open(GOLDEN / "v1"))
-    with pytest.raises(InputError, match=r"cascade: this dataset has no fine voxels"):
-        plain.fine_volume(STREET, plain.lighting("12:00", "clear"))
+    with pytest.raises(InputError, match=r"cascade -1: this dataset has no fine voxels"):
+        plain.volume(STREET, plain.lighting("12:00", "clear"), cascade=-1)
 
 
 def rewritten(path: Path, change_meta=None, change_arrays=None) -> None:

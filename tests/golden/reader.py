@@ -146,7 +146,7 @@ def read_distant(data: bytes) -> tuple[dict[str, Any], Arrays]:
 
 
 def read_fine(data: bytes) -> tuple[dict[str, Any], Arrays]:
-    """meta, and the arrays under the names and shapes of gi_core.fine_file.FineVoxels (section 6)."""
+    """meta, and the arrays under the names and shapes of gi_core.voxel_grid.VoxelGrid (section 6)."""
     meta, a = read_container(data, "FINE")
     first = np.array(meta["voxel_first"])
     weight = np.moveaxis(shares(a["voxel_weight"]), 0, 3)

@@ -41,7 +41,7 @@ def point(position: tuple[float, float, float], **changed: object) -> Lamp:
 
 def drawn(camera: Camera, lamps: tuple[Lamp, ...], lighting: Lighting, irradiance: float = 0.0) -> np.ndarray:
     class Served:
-        def __init__(self, position: np.ndarray) -> None:
+        def __init__(self, position: np.ndarray, room: int) -> None:
             self.values = np.full((6, *VOLUME_SHAPE, 3), irradiance, np.float32)
             self.origin = voxel_centre(volume_first_voxel(position))
             self.voxel_size = np.full(3, VOXEL_SIZE_M)

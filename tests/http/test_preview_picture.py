@@ -11,9 +11,10 @@ from gi_core.ambient_cube import FACE_DIRECTIONS
 from gi_core.constants import VOLUME_SHAPE, VOXEL_SIZE_M
 from gi_core.grid import SectorIndex, volume_first_voxel, voxel_centre
 from gi_core.lighting import DirectionalLight, Lighting
+from gi_core.world import Room
 from server import tonemap
 from server.camera import Camera
-from server.preview import MAX_VOLUMES, indirect_pixels, plan_volumes, render
+from server.preview import MAX_VOLUMES, indirect_irradiance, indirect_pixels, plan_volumes, render
 from server.preview_air import background
 from server.preview_scene import MAX_SECTORS, PreviewScene, plan_sectors
 from server.raycast import RayCaster
@@ -85,7 +86,7 @@ def served(values: np.ndarray) -> Callable[..., object]:
     class Served:
         """What a volume's readers use of it."""
 
-        def __init__(self, position: np.ndarray) -> None:
+        def __init__(self, position: np.ndarray, room: int) -> None:
             self.values = values
             self.origin = voxel_centre(volume_first_voxel(position))
             self.voxel_size = np.full(3, VOXEL_SIZE_M)
@@ -219,3 +220,19 @@ def test_the_meter_follows_lamps_but_never_opens_beyond_the_sky():
     under_black_sky = gray.copy()
     under_black_sky[:2] = 1e-5
     assert tonemap.metered(under_black_sky, 0.0) == pytest.approx(np.log2(800) - 3, abs=0.05)  # half the lightness
+
+
+def test_what_lies_in_a_room_reads_the_rooms_volume() -> None:
+    asked = []
+
+    def volume_at(position: np.ndarray, room: int) -> object:
+        asked.append(room)
+        values = np.full((6, 16, 32, 32, 3), 100.0 if room == 1 else 7.0, np.float32)
+        return served(values)(position, room)
+
+    hall = Room("hall", (0.0, 0.0, 0.0), (10.0, 4.0, 10.0))
+    points = np.array([[5.0, 0.0, 5.0], [5.0, 4.0, 5.0], [10.1, 2.0, 5.0], [30.0, 0.0, 5.0]])
+    normals = np.array([[0, 1, 0], [0, 1, 0], [1, 0, 0], [0, 1, 0]], np.float32)
+    light = indirect_irradiance(points, normals, volume_at, (hall,))
+    np.testing.assert_allclose(light[:, 0], [100, 7, 7, 7], rtol=1e-6)  # the hall's floor, its roof, its wall from outside, the street
+    assert sorted(set(asked)) == [0, 1]

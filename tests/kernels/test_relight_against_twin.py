@@ -14,6 +14,7 @@ from gi_core.layout import DIRECTIONAL_LIGHT
 from gi_core.relight import Relighter
 from gi_core.relight_input import RelightInput
 from gi_core.resident_sector import ResidentSector
+from gi_core.rooms import outdoor_blend
 from gi_core.volume import box_record, plan_boxes
 from kernels_cl import include_directory
 
@@ -199,7 +200,8 @@ def test_a_volume_equals_the_twins_blend(device, make_sector, basis):
     resident.fill_volume(box_record(box, sector), tuple(int(n) for n in box.size), target)
     values = np.zeros((basis, 16, 32, 32, 3), np.float32)
     device.read(target, values)
-    expected = relight_twin.blend_voxels(sector, cubes)
+    probe, weight = outdoor_blend(sector)
+    expected = relight_twin.blend_voxels(replace(sector, voxel_probe=probe, voxel_weight=weight), cubes)
     (nx, ny, nz) = box.size
     np.testing.assert_allclose(values[:, :4, :nz, :nx], np.moveaxis(expected[:, :nz, :nx], 3, 0), rtol=2e-5)
     # Above its layers a sector repeats the highest.

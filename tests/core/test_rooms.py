@@ -1,0 +1,56 @@
+"""Which voxels lend their light to which, and how rooms are named."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import distance_transform_edt
+
+from gi_core.constants import VOXEL_INDOORS, VOXEL_OUTDOORS, VOXEL_SOLID
+from gi_core.errors import InputError
+from gi_core.rooms import find_room, nearest, outdoor_blend, rooms_of
+from gi_core.world import Room
+
+ROOMS = (Room("hall", (0, 0, 0), (10, 4, 10)), Room("2", (8, 0, 8), (20, 4, 20)), Room("attic", (0, 4, 0), (10, 6, 10)))
+
+
+@pytest.mark.parametrize("shape", [(16, 32, 32), (3, 1, 5), (40, 21, 20)])
+@pytest.mark.parametrize("share", [0.001, 0.1, 1.0])
+def test_the_nearest_is_as_near_as_scipys(shape, share):
+    rng = np.random.default_rng(3)
+    wanted = rng.random(shape) < share
+    wanted[tuple(rng.integers(0, shape))] = True
+    y, z, x = nearest(wanted)
+    assert wanted[y, z, x].all()
+    found = np.sqrt(sum((a - b) ** 2 for a, b in zip((y, z, x), np.indices(shape), strict=True)))
+    np.testing.assert_allclose(found, distance_transform_edt(~wanted))
+
+
+def test_outdoors_nothing_blends_what_a_room_has(make_sector):
+    sector = make_sector(5)
+    probe, weight = outdoor_blend(sector)
+    outdoors = sector.voxel_class == VOXEL_OUTDOORS
+    np.testing.assert_array_equal(probe[outdoors], sector.voxel_probe[outdoors])
+    lent = {row.tobytes() for row in sector.voxel_weight[outdoors]}
+    for kind in (VOXEL_INDOORS, VOXEL_SOLID):
+        assert {row.tobytes() for row in weight[sector.voxel_class == kind]} <= lent
+
+
+def test_a_sector_without_rooms_is_as_it_was_baked(make_sector):
+    sector = make_sector(5)
+    sector.voxel_class[sector.voxel_class == VOXEL_INDOORS] = VOXEL_SOLID
+    probe, weight = outdoor_blend(sector)
+    assert probe is sector.voxel_probe
+    assert weight is sector.voxel_weight
+
+
+def test_rooms_are_found_by_name_then_by_number():
+    assert [find_room(ROOMS, text) for text in ("hall", "attic", "1", "3", "2")] == [1, 3, 1, 3, 2]
+    for text in ("0", "4", "-1", "cellar", ""):
+        with pytest.raises(InputError, match=r"expected one of 'hall', '2', 'attic', or a number of 1 to 3"):
+            find_room(ROOMS, text)
+    with pytest.raises(InputError, match="this world has none"):
+        find_room((), "hall")
+
+
+def test_where_rooms_overlap_the_first_one_counts():
+    at = np.array([[9.0, 1, 9], [15, 1, 15], [5, 5, 5], [5, 9, 5]])
+    assert rooms_of(at, ROOMS).tolist() == [1, 2, 3, 0]
