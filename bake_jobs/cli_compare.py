@@ -2,22 +2,27 @@
 
 import io
 import re
+import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from bake_jobs.compare import choose_sectors, compare_dataset
-from bake_jobs.compare_report import draw_chart, report_table, write_json
+from bake_jobs.compare_report import draw_chart, report_table, stored, write_json
 from bake_jobs.lamp_file import load_lamps
+from bake_jobs.sanity import NonsenseError
 from bake_jobs.scene_source import load_scene
 from gi_core.container import write_atomic
-from gi_core.dataset import Dataset
+from gi_core.dataset import Dataset, write_world
 from gi_core.errors import InputError
 from gi_core.grid import SectorIndex
 
 SectorRange = tuple[tuple[int, int], tuple[int, int]]
+NEIGHBOURS = tuple((dx, dz) for dx in (-1, 0, 1) for dz in (-1, 0, 1))
 REPORT_WIDTH = 120  # where no terminal says how wide it is
 
 
@@ -33,10 +38,11 @@ def run(
     json_path: Path | None,
     plot_path: Path | None,
     device: str | None,
+    store: bool = True,
 ) -> None:
-    """Measure, print the table on stdout, and write what was asked for.
+    """Measure, print the table on stdout, write what was asked for, and keep the report in the dataset where ``store`` says so.
 
-    Raises as ``compare_dataset``, ``load_lamps`` and ``load_scene`` do.
+    Raises as ``compare_dataset``, ``load_lamps`` and ``load_scene`` do, and NonsenseError where receivers have no light by day.
     """
     if plot_path is not None and plot_path.suffix.lower() != ".png":
         raise InputError(f"--plot {plot_path}: expected a name that ends in .png")
@@ -84,6 +90,30 @@ def run(
         picture = io.BytesIO()
         draw_chart(report).save(picture, "PNG")
         write_atomic(plot_path, picture.getvalue())
+    if report["dark_by_day"]:
+        shown = "; ".join(report["dark_by_day"][:5])
+        raise NonsenseError(f"{dataset_path}: this dataset is nonsense: receivers without any light by day in {shown}; bake it again")
+    if store and lamps is None:
+        _store(dataset_path, report, has_source=source is not None)
+
+
+def _store(dataset_path: Path, report: dict[str, Any], has_source: bool) -> None:
+    """Keep a report in its dataset, or say why not."""
+    dataset = Dataset.open(dataset_path)
+    known = dataset.world.sectors
+    at_edge = [(x, z) for x, z in report["sectors"] if any(SectorIndex(x + dx, z + dz) not in known for dx, dz in NEIGHBOURS)]
+    reason = ""
+    if dataset.world.bake_id != report["dataset"]:
+        reason = "was baked anew in the meantime"
+    elif at_edge and not has_source:
+        reason = f"sector {at_edge[0][0]},{at_edge[0][1]} is at the dataset's edge, and more of the city may lie beyond: name its --source"
+    else:
+        try:
+            write_world(dataset.path, replace(dataset.world, error_report=stored(report, dataset.world.basis)))
+        except OSError as error:
+            reason = error.strerror or str(error)
+    if reason:
+        print(f"sectorlight: {dataset_path}: the report was not stored: {reason}", file=sys.stderr)
 
 
 def split_states(text: str) -> list[str]:

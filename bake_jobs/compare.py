@@ -46,6 +46,7 @@ from gi_core.world import Lamp
 # Beyond this, a building hides less of the sky than the reference's noise.
 GEOMETRY_REACH_M = 1024.0
 DEFAULT_SECTORS = 9
+DAYLIGHT_LX = 100.0
 STAGES = ("probes", "near", "mid", "shaded", "floor")
 CUBE_STAGES = ("shaded_cube", "floor_cube")
 FINE_STAGES = ("shaded_fine",)
@@ -134,6 +135,7 @@ def compare_dataset(
     all_stages = STAGES + (CUBE_STAGES if len(bases) > 1 else ()) + (FINE_STAGES if world.has_fine_voxels else ())
     found = {state: {stage: StageSamples() for stage in all_stages} for state in lightings}
     air = {"open": 0, "called_solid": 0}
+    dark: list[str] = []
 
     for number, index in enumerate(chosen):
         points = choose_points(tracer.rays, dataset.geometry(index), dataset.sector(index), points_per_sector, _rng(seed, index))
@@ -157,6 +159,8 @@ def compare_dataset(
             _compare_surfaces(on_surfaces, served, points, reference, truth)
             if world.has_fine_voxels:
                 stages["shaded_fine"].add(_fine_light(engine, lighting, points), truth)
+            if is_day(lighting) and any(stages[stage].lacks_light() for stage in STAGES[:-1]):
+                dark.append(f"{index.x},{index.z} {state}")
             if progress is not None:
                 progress(number * len(lightings) + place + 1, len(chosen) * len(lightings), f"sector {index.x},{index.z} {state}")
     if not any(samples.count for stages in found.values() for samples in stages.values()):
@@ -174,8 +178,15 @@ def compare_dataset(
         "seed": seed,
         # A client gets filled light where the mask says solid; the judge's voxels there count all the same.
         "open_air_called_solid": air["called_solid"] / max(air["open"], 1),
+        # Sectors and states with a value of exactly zero, or none at all, where the reference is lit by day.
+        "dark_by_day": dark,
         "floor_fill": "voxels outside open air are filled from the nearest voxel in it, as the server does",
     }
+
+
+def is_day(lighting: Lighting) -> bool:
+    """Whether the open sky lights level ground by a hundred lux or more."""
+    return bool(lighting.sky_cube[2].max() >= DAYLIGHT_LX)
 
 
 def choose_sectors(dataset: Dataset, seed: int, count: int = DEFAULT_SECTORS) -> list[SectorIndex]:

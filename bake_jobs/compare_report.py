@@ -7,6 +7,7 @@ voxels.
     median, p95   of the relative error
     bias    sum(served - reference) / sum(reference)
     nrmse   root mean square of (served - reference), over the mean reference
+    median_ci   95 % confidence interval of the median: of the points' choice and of the path tracer's noise together
     noise   median relative standard error of the reference itself; an error near it is not resolved
 """
 
@@ -23,6 +24,7 @@ from rich.table import Table
 from bake_jobs.path_tracer import Estimate
 from gi_core.arrays import AnyArray, Float64
 from gi_core.container import write_atomic
+from gi_core.error_report import expected_error
 from gi_core.spectrum import LUMINANCE_FROM_RGB
 
 # Below this share of the mean a point is black to the eye, and dividing by it would only measure noise.
@@ -49,19 +51,31 @@ class StageSamples:
         # One path carries all channels, so their errors move together and add.
         self.standard_error.append(_luminance(reference.standard_error))
 
+    def lacks_light(self) -> bool:
+        """Whether what was added last has a value of exactly zero, or one that is no number, where the reference has light."""
+        if not self.served or not len(self.served[-1]):
+            return False
+        served, reference = self.served[-1], self.reference[-1]
+        lit = reference > DARKEST_SHARE_OF_MEAN * reference.mean()
+        return bool(((served == 0) | ~np.isfinite(served))[lit].any())
+
     @property
     def count(self) -> int:
         return sum(len(values) for values in self.reference)
 
 
+FIGURES = ("median", "p95", "bias", "nrmse", "noise", "median_ci")
+_RESAMPLES = 50
+
+
 def summarise(samples: StageSamples) -> dict[str, Any]:
-    """``{n, median, p95, bias, nrmse, noise}`` of one stage; all but n are None where there is nothing, or no light, to compare."""
+    """``n`` and FIGURES of one stage; all but n are None where there is nothing, or no light, to compare."""
     if samples.count == 0:
-        return {"n": 0, "median": None, "p95": None, "bias": None, "nrmse": None, "noise": None}
+        return {"n": 0} | dict.fromkeys(FIGURES)
     served, reference, error = (np.concatenate(v) for v in (samples.served, samples.reference, samples.standard_error))
     mean = float(reference.mean())
     if not mean > 0:
-        return {"n": len(served), "median": None, "p95": None, "bias": None, "nrmse": None, "noise": None}
+        return {"n": len(served)} | dict.fromkeys(FIGURES)
     scale = np.maximum(reference, DARKEST_SHARE_OF_MEAN * mean)
     relative = np.abs(served - reference) / scale
     return {
@@ -71,7 +85,18 @@ def summarise(samples: StageSamples) -> dict[str, Any]:
         "bias": float((served - reference).sum() / reference.sum()),
         "nrmse": float(np.sqrt(np.mean((served - reference) ** 2)) / mean),
         "noise": float(np.median(error / scale)),
+        "median_ci": _confidence(served, reference, error, scale),
     }
+
+
+def _confidence(served: Float64, reference: Float64, error: Float64, scale: Float64) -> list[float]:
+    """Where the median relative error lies with 95 % confidence: other points drawn from these, and the reference off by its own noise."""
+    rng = np.random.default_rng(0)
+    relative = np.abs(served - reference) / scale
+    drawn = [np.median(relative[rng.integers(0, len(relative), len(relative))]) for _ in range(_RESAMPLES)]
+    noisy = [np.median(np.abs(served - reference - error * rng.standard_normal(len(error))) / scale) for _ in range(_RESAMPLES)]
+    middle, reach = float(np.median(relative)), 1.96 * float(np.hypot(np.std(drawn), np.std(noisy)))
+    return [max(middle - reach, 0.0), middle + reach]
 
 
 def report_table(report: dict[str, Any]) -> Table:
@@ -79,11 +104,12 @@ def report_table(report: dict[str, Any]) -> Table:
     table = Table(title=f"{report['preset']}, {report['basis']}: error against the path tracer")
     table.add_column("state")
     table.add_column("stage")
-    for name in ("n", "median", "p95", "bias", "nrmse", "noise"):
+    for name in ("n", "median", "95 % sure", "p95", "bias", "nrmse", "noise"):
         table.add_column(name, justify="right")
     for state, stages in report["states"].items():
         for row, (stage, numbers) in enumerate(stages.items()):
             percents = [_percent(numbers[name], signed=name == "bias") for name in ("median", "p95", "bias", "nrmse", "noise")]
+            percents.insert(1, _range(numbers["median_ci"]))
             table.add_row(state if row == 0 else "", stage, f"{numbers['n']:,}", *percents, end_section=row == len(stages) - 1)
     table.caption = (
         f"{len(report['sectors'])} sectors, seed {report['seed']}, {report['samples']} paths per reference value. "
@@ -139,6 +165,17 @@ def draw_chart(report: dict[str, Any]) -> Image.Image:
 def _luminance(values: AnyArray) -> Float64:
     """(..., 3) -> flat (n,) float64."""
     return np.asarray(np.asarray(values, np.float64) @ LUMINANCE_FROM_RGB).reshape(-1)
+
+
+def _range(ends: list[float] | None) -> str:
+    return "-" if ends is None else " - ".join(f"{100 * end:.1f}" for end in ends)
+
+
+def stored(report: dict[str, Any], own_basis: str) -> dict[str, Any]:
+    """The report as world.json keeps it: without what that says itself, and with the error that a volume's reader may expect."""
+    kept = {name: value for name, value in report.items() if name not in ("preset", "basis", "dataset", "floor_fill")}
+    expected = expected_error(report, own_basis, own_basis)
+    return kept if expected is None else kept | {"expected_error": expected}
 
 
 def _percent(value: float | None, signed: bool = False) -> str:

@@ -26,6 +26,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from bake_jobs.config import BakeSettings, settings_for, with_knobs, with_target_error
 from bake_jobs.geometry_clip import SectorCutter
+from bake_jobs.sanity import expect_sense
 from bake_jobs.scene import Scene, scene_digest
 from bake_jobs.scene_source import load_scene
 from bake_jobs.sector_job import SectorBaker
@@ -36,6 +37,7 @@ from gi_core.dataset import COUNTS, DISTANT_FILE, WORLD_FILE, SectorFacts, World
 from gi_core.errors import FormatError, InputError, SectorlightError
 from gi_core.grid import SectorIndex
 from gi_core.json_fields import LARGEST_INTEGER
+from gi_core.sector import Sector
 from gi_core.sun_table import SunTable
 
 # Part of the bake id: raised whenever the same settings would give other bytes than before.
@@ -94,8 +96,9 @@ def bake(
 
     target_error : spend probes until the bake's own estimate of each sector is below, at most 1000 a sector; None leaves it to the preset
 
-    Raises InputError (SourceError among them) for input that cannot be baked, WorkerLostError when a worker dies, DatasetWriteError
-    when the folder cannot be written. An interrupt leaves finished sectors in place, and the same call resumes.
+    Raises InputError (SourceError among them) for input that cannot be baked, NonsenseError for a bake that cannot be right (sectors stay,
+    without a world.json), WorkerLostError when a worker dies, DatasetWriteError when the folder cannot be written. An interrupt leaves
+    finished sectors in place, and the same call resumes.
     """
     console = console or Console(stderr=True)
     settings = with_knobs(settings_for(quality), knobs) if knobs else settings_for(quality)
@@ -137,6 +140,11 @@ def bake(
                 done[finished.index] = finished
                 progress.advance(task)
     wall_seconds = time.perf_counter() - started
+
+    def read(index: SectorIndex) -> Sector:
+        return sector_file.read(sector_path(output, index))[0]
+
+    expect_sense({i: done[i].facts for i in wanted}, read, settings.sky_sources)
     texels = distant_file.assemble({i: f.distant_sky for i, f in done.items()})
     world = WorldInfo(
         name=scene.name,

@@ -22,6 +22,7 @@ from gi_core.constants import (
 )
 from gi_core.dataset import Dataset
 from gi_core.device import shared_device
+from gi_core.error_report import expected_error
 from gi_core.errors import FormatError, InputError, OutsideWorldError
 from gi_core.fine_volume import interpolated, merge
 from gi_core.grid import SectorIndex, volume_first_voxel
@@ -176,7 +177,7 @@ class Engine:
         for box in unlit:  # it has air, but no probe: lit like columns without a sector, by the nearest that are
             has_light[box_slices(box)[1:]] = False
         _fill_columns(values, has_light)
-        return Volume(values, mask, first, tuple(box.index for box in boxes), basis, self._expected_error)
+        return Volume(values, mask, first, tuple(box.index for box in boxes), basis, self._expected_error(basis))
 
     def _fine_volume(self, position: Float64, light: _Light, basis: str) -> Volume:
         world = self.dataset.world
@@ -199,7 +200,7 @@ class Engine:
                 fine.fill(box, target, resident.converted(basis), basis)
                 self._device.read(target, filled)
             merge(fine, box, filled, values, mask)
-        return Volume(values, mask, first, tuple(box.index for box in boxes), basis, self._expected_error, cascade=-1)
+        return Volume(values, mask, first, tuple(box.index for box in boxes), basis, self._expected_error(basis, -1), cascade=-1)
 
     def _coarse_volume(self, position: Float64, light: _Light, basis: str, cascade: int) -> Volume:
         first = volume_first_voxel(position, cascade)
@@ -213,7 +214,7 @@ class Engine:
                 sums.add(resident.sector, self._all_voxels(resident, basis) if resident.sector.probe_count else None)
         values, mask, has_light = sums.finish()
         _fill_columns(values, has_light)
-        return Volume(values, mask, first, tuple(sectors), basis, self._expected_error, cascade)
+        return Volume(values, mask, first, tuple(sectors), basis, self._expected_error(basis, cascade), cascade)
 
     def interior(
         self,
@@ -257,7 +258,7 @@ class Engine:
             there = f"room {rooms[wanted - 1].name!r}" if wanted else "a room"
             raise InputError(f"kind=interior: the volume around this place reaches no voxel of {there}; GET /v1/world lists rooms")
         values = np.ascontiguousarray(values[(slice(None), *nearest(inside))])
-        return Volume(values, mask, first, tuple(box.index for box in boxes), basis, self._expected_error, room=wanted)
+        return Volume(values, mask, first, tuple(box.index for box in boxes), basis, room=wanted)
 
     def distant(self, lighting: Lighting) -> Distant:
         """One texel per sector of the whole world, lit by the sky alone (slide "Distant shading"). Raises CorruptFileError."""
@@ -324,10 +325,8 @@ class Engine:
             raise InputError(f"basis: this dataset was baked in {own}; expected {' or '.join(served_from(own))}, found {basis}")
         return own if basis is None else basis
 
-    @property
-    def _expected_error(self) -> float | None:
-        report = self.dataset.world.error_report
-        return None if report is None else report.get("expected_error")
+    def _expected_error(self, basis: str, cascade: int = 0) -> float | None:
+        return expected_error(self.dataset.world.error_report, self.dataset.world.basis, basis, cascade)
 
     def _set_lamps(self, resident: ResidentSector, lamps: tuple[Lamp, ...]) -> None:
         index = resident.sector.index

@@ -165,6 +165,9 @@ def compare(
     ] = None,
     json_path: Annotated[Path | None, typer.Option("--json", metavar="OUT", help="Write the report here.")] = None,
     plot_path: Annotated[Path | None, typer.Option("--plot", metavar="OUT.png", help="Draw medians and 95th percentiles here.")] = None,
+    store: Annotated[
+        bool, typer.Option("--store/--no-store", help="Keep the report in the dataset, for info and servers; never one with other --lamps.")
+    ] = True,
     device: DeviceOption = None,
 ) -> None:
     """Measure a dataset's error against the path tracer: at probes, at voxels, and at shaded points as a client samples them."""
@@ -173,9 +176,8 @@ def compare(
     chosen = cli_compare.sectors_of(dataset, parse_sectors(sectors) if ":" in sectors else sectors, seed)
     try:
         with writing(json_path or plot_path):
-            cli_compare.run(
-                dataset, cli_compare.split_states(states), chosen, points, samples, seed, source, lamps, json_path, plot_path, device
-            )
+            named = cli_compare.split_states(states)
+            cli_compare.run(dataset, named, chosen, points, samples, seed, source, lamps, json_path, plot_path, device, store)
     except KeyboardInterrupt:
         fail("interrupted; nothing was written", INTERRUPTED)
 

@@ -9,9 +9,12 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from gi_core.dataset import Dataset
+from gi_core.dataset import Dataset, WorldInfo
+from gi_core.error_report import expected_error
 from gi_core.errors import InputError, SectorMissingError
 from gi_core.grid import SectorIndex
+
+REPORT_WIDTH = 140  # where no terminal says how wide it is
 
 
 def show_dataset(path: Path) -> None:
@@ -42,7 +45,8 @@ def show_dataset(path: Path) -> None:
     if world.error_report is None:
         console.print("No error report: `sectorlight compare` measures one.")
     else:
-        console.print(_table("Error report", world.error_report))
+        wide = console if console.is_terminal else Console(width=REPORT_WIDTH)
+        wide.print(_report(world))
 
 
 def show_sector(path: Path, text: str) -> None:
@@ -71,6 +75,28 @@ def show_sector(path: Path, text: str) -> None:
         "geometry": f"{len(dataset.geometry(index).triangles):,} triangles",
     }
     Console().print(_table(f"Sector {index.x},{index.z}", rows))
+
+
+def _report(world: WorldInfo) -> Table:
+    """What ``compare`` measured: median, 95th percentile and bias of each stage in each state, in per cent."""
+    report = world.error_report or {}
+    states = {name: stages for name, stages in report.get("states", {}).items() if isinstance(stages, Mapping)}
+    rows = ("probes", "near", "mid", "shaded", "floor", "shaded_cube", "floor_cube", "shaded_fine")
+    expected = expected_error(report, world.basis, world.basis)
+    title = "Error report: median / 95th percentile / bias [%]"
+    table = Table(title=title if expected is None else f"{title}; expected on surfaces: {100 * expected:.1f} %", title_justify="left")
+    for column in ("", *states):
+        table.add_column(escape(column))
+    for row in rows:
+        if any(row in stages for stages in states.values()):
+            table.add_row(row, *(_figures(stages.get(row)) for stages in states.values()))
+    return table
+
+
+def _figures(numbers: Any) -> str:
+    found = [numbers.get(name) for name in ("median", "p95", "bias")] if isinstance(numbers, Mapping) else []
+    known = [100 * value for value in found if isinstance(value, int | float)]
+    return f"{known[0]:.1f} / {known[1]:.0f} / {known[2]:+.1f}" if len(known) == 3 else "-"
 
 
 def _table(title: str, rows: Mapping[str, Any]) -> Table:

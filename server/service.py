@@ -10,6 +10,7 @@ from pathlib import Path
 
 from gi_core.dataset import Dataset
 from gi_core.engine import Engine
+from gi_core.error_report import expected_error
 from gi_core.grid import SectorIndex
 from gi_core.lighting import Lighting
 from server.finished_replies import FinishedReplies
@@ -75,9 +76,9 @@ class Service:
 
     @property
     def expected_error(self) -> float | None:
-        """Median relative error that the dataset's error report gives; None without a report."""
-        report = self.dataset.world.error_report
-        return None if report is None else report.get("expected_error")
+        """Median relative error that the dataset's error report gives for players' volumes, cubes; None without a report."""
+        world = self.dataset.world
+        return expected_error(world.error_report, world.basis, "cube")
 
     @property
     def failed_sectors(self) -> dict[SectorIndex, str]:

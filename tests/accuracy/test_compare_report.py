@@ -27,7 +27,7 @@ def report(**medians):
     """A report of two states whose medians are as given for the first and ten times that for the second."""
     found = {}
     for factor, state in ((1, "noon"), (10, "low_sun")):
-        numbers = {"n": 600, "p95": 0.5, "bias": -0.03, "nrmse": 0.2, "noise": 0.007}
+        numbers = {"n": 600, "p95": 0.5, "bias": -0.03, "nrmse": 0.2, "noise": 0.007, "median_ci": [0.01, 0.02]}
         found[state] = {stage: {**numbers, "median": factor * medians.get(stage, 0.01)} for stage in STAGES}
     return {
         "preset": "talk", "basis": "cube", "states": found, "sectors": [[0, 0]], "seed": 0, "samples": 64,
@@ -91,7 +91,7 @@ def test_table_names_every_stage_and_rounds_to_a_tenth_of_a_percent():
 
 def test_table_and_chart_bear_an_empty_stage():
     empty = report()
-    empty["states"]["noon"]["mid"] = {"n": 0, "median": None, "p95": None, "bias": None, "nrmse": None, "noise": None}
+    empty["states"]["noon"]["mid"] = {"n": 0, "median": None, "p95": None, "bias": None, "nrmse": None, "noise": None, "median_ci": None}
     console = Console(file=io.StringIO(), width=200)
     console.print(report_table(empty))
     assert draw_chart(empty).size == CHART_SIZE
@@ -103,3 +103,24 @@ def test_chart_bars_are_logarithmic():
     first = np.flatnonzero((pixels == [0x48, 0x78, 0xA8]).all(axis=-1).sum(axis=1) > 100)
     second = np.flatnonzero((pixels == [0xD0, 0x8A, 0x3C]).all(axis=-1).sum(axis=1) > 100)
     assert first[0] - second[0] == pytest.approx((CHART_SIZE[1] - 100) / math.log10(10 / 0.001), abs=1.5)
+
+
+def test_the_confidence_interval_holds_the_true_median_and_narrows_with_more_points():
+    """Errors drawn from a known distribution, many times: the interval misses its median as seldom as it says."""
+    rng, widths = np.random.default_rng(1), {}
+    for count, noise in ((50, 0.0), (800, 0.0), (800, 0.3)):
+        held, width = 0, []
+        for _ in range(60):
+            reference = np.full((count, 3), 100.0)
+            served = reference * (1 + rng.exponential(0.1, count)[:, None])  # median 0.1 ln 2
+            samples = StageSamples()
+            noisy = reference * (1 + noise * 0.1 * rng.standard_normal(count)[:, None])
+            samples.add(served, Estimate(noisy, np.full((count, 3), noise * 10.0)))
+            low, high = summarise(samples)["median_ci"]
+            held += low <= 0.1 * np.log(2) <= high
+            width.append(high - low)
+        widths[count, noise] = np.mean(width)
+        if noise == 0:
+            assert held >= 52
+    assert widths[800, 0.0] < widths[50, 0.0] / 2.5
+    assert widths[800, 0.3] > widths[800, 0.0]

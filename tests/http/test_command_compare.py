@@ -1,19 +1,25 @@
 """``sectorlight compare``: its options, its files, its refusals. What it measures is held elsewhere."""
 
 import json
+import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from PIL import Image
 
 from bake_jobs.cli_compare import sectors_of, split_states
 from bake_jobs.compare import STAGES
-from gi_core.dataset import Dataset
+from gi_core import sector_file
+from gi_core.dataset import Dataset, write_world
+from gi_core.engine import Engine
 from gi_core.errors import InputError
 
 RunCommand = Callable[..., Any]
+SOURCE = "procedural:midtown?blocks=1x1&seed=1"
 SMALL = ("--sectors", "1", "--points", "3", "--samples", "16")
 
 
@@ -34,7 +40,56 @@ def test_it_prints_a_table_and_writes_json_and_a_chart(sectorlight: RunCommand, 
         assert word in done.stdout
     with Image.open(tmp_path / "out.png") as picture:
         assert picture.format == "PNG"
-    assert {path: path.stat().st_mtime_ns for path in city.rglob("*")} == before  # the dataset is only read
+    # A single block ends where the bake does: what lies beyond may be missing, so its report is not believed, nor is anything written.
+    assert {path: path.stat().st_mtime_ns for path in city.rglob("*")} == before
+    assert "the report was not stored: sector" in done.stderr
+    assert "name its --source" in done.stderr
+
+
+def test_the_report_stays_in_the_dataset_and_is_quoted(sectorlight: RunCommand, city: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "city"
+    shutil.copytree(city, copy)
+    source = ("--source", SOURCE)
+    done = sectorlight("compare", str(copy), *SMALL, "--states", "noon,overcast", *source, "--json", str(tmp_path / "out.json"))
+    assert done.returncode == 0, done.stderr
+    measured, kept = json.loads((tmp_path / "out.json").read_text()), Dataset.open(copy).world.error_report
+    assert kept is not None
+    assert kept["states"] == measured["states"]
+    medians = [measured["states"][state]["shaded"]["median"] for state in ("noon", "overcast")]
+    assert kept["expected_error"] == pytest.approx(np.median(medians))
+    shown = sectorlight("info", str(copy))
+    assert f"expected on surfaces: {100 * np.median(medians):.1f} %" in shown.stdout
+    assert "overcast" in shown.stdout
+    engine = Engine(Dataset.open(copy))
+    volume = engine.volume(np.array([30.0, 5.0, 30.0]), engine.lighting("12:00", "clear"))
+    assert volume.expected_error == pytest.approx(np.median(medians))
+    assert engine.volume(np.array([30.0, 5.0, 30.0]), engine.lighting("12:00", "clear"), cascade=1).expected_error is None
+    # Kept by a report that is not to be: one that was not asked to stay, and one of other lamps.
+    lamps = tmp_path / "lamps.toml"
+    lamps.write_text('[[lamp]]\nname = "one"\nposition = [30, 9, 5]\nlumens = 1.0\n')
+    for more in (("--no-store",), ("--lamps", str(lamps))):
+        assert sectorlight("compare", str(copy), *SMALL, "--states", "noon", *source, *more).returncode == 0
+        assert Dataset.open(copy).world.error_report == kept
+
+
+def test_a_dataset_that_is_dark_by_day_fails(sectorlight: RunCommand, city: Path, tmp_path: Path) -> None:
+    """Every probe's weights set to nothing, as a bake that went wrong would have them: exit 1, nothing stored."""
+    copy = tmp_path / "city"
+    shutil.copytree(city, copy)
+    dataset = Dataset.open(copy)
+    sectors = dict(dataset.world.sectors)
+    for index, facts in sectors.items():
+        path = dataset.sector_path(index)
+        sector, meta = sector_file.read(path)
+        data = sector_file.encode(replace(sector, factor_scale=np.zeros_like(sector.factor_scale)), meta, dataset.world.sky_patches)
+        path.write_bytes(data)
+        sectors[index] = replace(facts, bytes=len(data))
+    write_world(copy, replace(dataset.world, sectors=sectors))
+    done = sectorlight("compare", str(copy), *SMALL, "--states", "noon,night", "--source", SOURCE)
+    assert done.returncode == 1
+    assert "this dataset is nonsense: receivers without any light by day in" in done.stderr
+    assert "night" not in done.stderr
+    assert Dataset.open(copy).world.error_report is None
 
 
 def test_the_same_seed_gives_the_same_report(sectorlight: RunCommand, city: Path, tmp_path: Path) -> None:
