@@ -19,6 +19,7 @@ Of the dataset only the served light is believed. Points come from ``compare_poi
 must be handed in as ``scene``, or the reference is lit through the gap.
 """
 
+import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,7 +32,7 @@ from bake_jobs.compare_report import StageSamples, summarise
 from bake_jobs.compare_states import DEFAULT_STATES, parse_states
 from bake_jobs.path_tracer import Estimate, PathTracer, Projector
 from bake_jobs.scene import Scene
-from gi_core.arrays import Float32, Float64, Int64
+from gi_core.arrays import AnyArray, Float32, Float64, Int64
 from gi_core.basis import conversion, projection_weights
 from gi_core.constants import BASIS_SIZES, FINE_VOXEL_SIZE_M, SECTOR_SIZE_M, VOLUME_SHAPE, VOXEL_NO_SECTOR, VOXEL_OUTDOORS
 from gi_core.dataset import Dataset
@@ -39,7 +40,7 @@ from gi_core.engine import Engine
 from gi_core.errors import InputError
 from gi_core.grid import SectorIndex, voxel_centre
 from gi_core.lighting import Lighting
-from gi_core.lights import lamps_on
+from gi_core.lights import lamps_digest, lamps_on
 from gi_core.volume import Volume, sample_volume
 from gi_core.world import Lamp
 
@@ -65,29 +66,51 @@ class Reference:
     samples: int
     rng: np.random.Generator
     basis: str = "cube"
+    known: dict[bytes, list[Estimate]] | None = None
+    """Estimates by what was asked for: shared by comparisons of bakes of one scene, whose points off the probes are the same."""
 
     def cubes(self, points: Float64) -> Estimate:
         """(n, 3) [m] -> Estimate of (n, 6, 3) [lx]: the six faces as the dataset's basis has them."""
-        return self._projected(points, lambda directions: projection_weights(self.basis, directions) @ conversion(self.basis, "cube").T)
+
+        def faces(directions: Float32) -> AnyArray:
+            return projection_weights(self.basis, directions) @ conversion(self.basis, "cube").T
+
+        return self._once(("cubes", self.basis), (points,), lambda seed: [self._projected(points, faces, seed)])[0]
 
     def exact(self, points: Float64, bases: tuple[str, ...]) -> list[Estimate]:
         """(n, 3) [m] -> Estimate of (n, B, 3) [lx] in each basis, from the same paths."""
         ends = np.cumsum([BASIS_SIZES[basis] for basis in bases])[:-1].tolist()
         if bases == ("cube",):
             return [self.cubes(points)]
-        found = self._projected(points, lambda d: np.concatenate([projection_weights(basis, d) for basis in bases], axis=1))
-        parts = (np.split(values, ends, axis=1) for values in (found.mean, found.standard_error))
-        return [Estimate(mean, noise) for mean, noise in zip(*parts, strict=True)]
 
-    def _projected(self, points: Float64, project: Projector) -> Estimate:
-        return self.tracer.projected_irradiance(points, self.lighting, self.lamps, project, samples=self.samples, seed=self._seed())
+        def trace(seed: int) -> list[Estimate]:
+            found = self._projected(points, lambda d: np.concatenate([projection_weights(basis, d) for basis in bases], axis=1), seed)
+            parts = (np.split(values, ends, axis=1) for values in (found.mean, found.standard_error))
+            return [Estimate(mean, noise) for mean, noise in zip(*parts, strict=True)]
+
+        return self._once(("exact", *bases), (points,), trace)
 
     def surfaces(self, points: Float64, normals: Float64) -> Estimate:
         """(n, 3) [m] and unit normals -> Estimate of (n, 3) [lx]."""
-        return self.tracer.surface_irradiance(points, normals, self.lighting, self.lamps, samples=self.samples, seed=self._seed())
 
-    def _seed(self) -> int:
-        return int(self.rng.integers(1 << 62))
+        def trace(seed: int) -> list[Estimate]:
+            return [self.tracer.surface_irradiance(points, normals, self.lighting, self.lamps, samples=self.samples, seed=seed)]
+
+        return self._once(("surfaces",), (points, normals), trace)[0]
+
+    def _projected(self, points: Float64, project: Projector, seed: int) -> Estimate:
+        return self.tracer.projected_irradiance(points, self.lighting, self.lamps, project, samples=self.samples, seed=seed)
+
+    def _once(self, what: tuple[str, ...], places: tuple[Float64, ...], trace: Callable[[int], list[Estimate]]) -> list[Estimate]:
+        """``trace`` with a seed of its own, or what it gave when it was last asked for the same."""
+        seed = int(self.rng.integers(1 << 62))
+        if self.known is None:
+            return trace(seed)
+        asked = repr((what, seed, self.samples, self.lighting.digest, lamps_digest(self.lamps)))
+        key = hashlib.blake2b(asked.encode() + b"".join(place.tobytes() for place in places)).digest()
+        if key not in self.known:
+            self.known[key] = trace(seed)
+        return self.known[key]
 
 
 def compare_dataset(
@@ -102,6 +125,7 @@ def compare_dataset(
     scene: Scene | None = None,
     lamps: Sequence[Lamp] | None = None,
     progress: Progress | None = None,
+    known: dict[bytes, list[Estimate]] | None = None,
 ) -> dict[str, Any]:
     """Measure a dataset's error; the same arguments give the same report.
 
@@ -114,6 +138,7 @@ def compare_dataset(
     scene : the source's triangles, wanted when the bake left out what surrounds these sectors; otherwise the dataset's are used
     lamps : lit with these instead of the dataset's own
     progress : called with (steps done, steps in all, what was done)
+    known : reference values of earlier comparisons in the same scene, which are not traced again; new ones are added
 
     Returns
     -------
@@ -142,13 +167,12 @@ def compare_dataset(
         for place, (state, lighting) in enumerate(lightings.items()):
             volume = engine.volume(points.eye, lighting)
             if place == 0:
-                known = points.open_voxel & (volume.mask != VOXEL_NO_SECTOR)
-                air["open"] += int(known.sum())
-                air["called_solid"] += int((known & (volume.mask < VOXEL_OUTDOORS)).sum())
+                open_air = points.open_voxel & (volume.mask != VOXEL_NO_SECTOR)
+                air["open"] += int(open_air.sum())
+                air["called_solid"] += int((open_air & (volume.mask < VOXEL_OUTDOORS)).sum())
             stages = found[state]
-            reference = Reference(
-                tracer, lighting, lamps_on(engine.lamps, lighting), samples, _rng(seed, index, lighting.digest), world.basis
-            )
+            shining, rng = lamps_on(engine.lamps, lighting), _rng(seed, index, lighting.digest)
+            reference = Reference(tracer, lighting, shining, samples, rng, world.basis, known)
             lit = engine.lit_sector(index, lighting)[points.probe]
             stages["probes"].add(_six_faces(lit, world.basis), reference.cubes(points.probe_position))
             _compare_voxels(stages["near"], volume, points.near, reference)

@@ -71,14 +71,17 @@ def choose_points(rays: RayScene, geometry: Geometry, sector: Sector, count: int
     free = seen.open_air & in_sector
     probe_position = sector.probe_position.astype(np.float64) + origin
     outdoors = (sector.probe_room == ROOM_OUTDOORS) & (sector.probe_flags & PROBE_IN_MARGIN == 0)
-    probe = _some(np.flatnonzero(outdoors & look_around(rays, probe_position).open_air), count, rng)
     surface, normal = _surface_points(rays, geometry, (voxel_centre(first), VOLUME_SHAPE), count, rng)
+    near = index[_some(np.flatnonzero(free & (seen.distance <= NEAR_M)), count, rng)]
+    mid = index[_some(np.flatnonzero(free & (seen.distance >= MID_M)), count, rng)]
+    # Probes come last: all other points are the same for whatever was baked of a place.
+    probe = _some(np.flatnonzero(outdoors & look_around(rays, probe_position).open_air), count, rng)
     return SectorPoints(
         eye=eye,
         probe=probe,
         probe_position=probe_position[probe],
-        near=index[_some(np.flatnonzero(free & (seen.distance <= NEAR_M)), count, rng)],
-        mid=index[_some(np.flatnonzero(free & (seen.distance >= MID_M)), count, rng)],
+        near=near,
+        mid=mid,
         surface=surface,
         normal=normal,
         open_voxel=seen.open_air.reshape(VOLUME_SHAPE),

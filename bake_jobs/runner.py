@@ -12,7 +12,7 @@ import shutil
 import signal
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -88,12 +88,13 @@ def bake(
     console: Console | None = None,
     knobs: Sequence[str] = (),
     target_error: float | None = None,
+    on_baked: Callable[[float], None] | None = None,
 ) -> WorldInfo:
     """Bake a source into a dataset folder and print a summary.
 
     jobs : worker processes; None takes every core. sectors : half-open ranges ((x0, x1), (z0, z1)); None takes all.
     restart : bake everything anew instead of skipping finished sectors. seed : recorded with the dataset. knobs : ``config.with_knobs``.
-
+    on_baked : called with the processor seconds of each sector that was baked
     target_error : spend probes until the bake's own estimate of each sector is below, at most 1000 a sector; None leaves it to the preset
 
     Raises InputError (SourceError among them) for input that cannot be baked, NonsenseError for a bake that cannot be right (sectors stay,
@@ -138,6 +139,8 @@ def bake(
             task = progress.add_task("bake", total=len(wanted), completed=len(done), preset=settings.preset)
             for finished in _run(scene, settings, table, bake_id, output, remaining, workers):
                 done[finished.index] = finished
+                if on_baked is not None:
+                    on_baked(finished.seconds)
                 progress.advance(task)
     wall_seconds = time.perf_counter() - started
 

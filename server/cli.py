@@ -183,6 +183,38 @@ def compare(
 
 
 @app.command()
+def tradeoff(
+    source: Annotated[str, typer.Argument(help="What to bake, as `bake` takes it.")],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="OUTDIR", help="For the table, JSON, plot, and what a rerun goes on from.")
+    ],
+    variants: Annotated[
+        str,
+        typer.Option(help="Comma-separated presets, groups (rays, cells, placement, spacing, sky, feedback, basis, voxels, sun) or knobs."),
+    ] = "",
+    sectors: Annotated[str | None, typer.Option(help="X0:X1,Z0:Z1, half open; without it four in the middle.")] = None,
+    states: Annotated[str, typer.Option(help="Moments, as `compare` takes them.")] = "noon,low_sun,overcast",
+    points: Annotated[int, typer.Option(min=1, max=100_000, help="Of each kind per sector.")] = 60,
+    samples: Annotated[int, typer.Option(min=16, max=1 << 20, help="Paths per reference value.")] = 1024,
+    seed: Annotated[int, typer.Option(min=0, help="Of points and paths.")] = 0,
+    jobs: Annotated[int, typer.Option(min=0, max=1024, help="Processes of a bake; 0 means one per core.")] = 0,
+    restart: Annotated[bool, typer.Option("--restart/--resume", help="Measure all anew, or keep the rows that are there.")] = False,
+    device: DeviceOption = None,
+) -> None:
+    """Bake a few sectors in many ways and show what each costs: error against bytes, bake seconds and tick microseconds."""
+    from bake_jobs import cli_compare, cli_tradeoff
+
+    names = [name.strip() for name in variants.split(",") if name.strip()]
+    chosen = None if sectors is None else parse_sectors(sectors)
+    try:
+        with writing(output):
+            moments = cli_compare.split_states(states)
+            cli_tradeoff.sweep(source, output, names, chosen, moments, points, samples, seed, jobs, restart, device)
+    except KeyboardInterrupt:
+        fail("interrupted; finished variants are kept: the same command goes on from there", INTERRUPTED)
+
+
+@app.command()
 def strip(
     dataset: Annotated[Path, typer.Argument(help="A baked dataset's folder.")],
     eye: Annotated[str, typer.Option(metavar="X,Y,Z", help="Where the camera is [m].")],

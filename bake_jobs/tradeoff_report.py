@@ -1,0 +1,107 @@
+"""What ``tradeoff`` says: one table, and one plot of error against each price."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from PIL import Image, ImageDraw
+
+from bake_jobs.tradeoff import error_of, pareto
+
+Row = dict[str, Any]
+PRICES = {"bytes": ("kB a sector", 1e-3), "bake_seconds": ("core seconds a sector", 1.0), "tick_us": ("tick [us]", 1.0)}
+STAGES = {
+    "probes": "at probes",
+    "near": "near",
+    "mid": "mid",
+    "shaded": "shaded",
+    "shaded_cube": "served as cube",
+    "shaded_fine": "cascade -1",
+}
+PANEL, MARGIN, LEGEND_ROW = (430, 430), (52, 40, 16, 44), 15  # margin: left, top, right, bottom
+PRESET_COLOURS = {"draft": "#888888", "talk": "#d08a3c", "standard": "#4878a8", "reference": "#5f9e5a"}
+FRONT = "#b85a5a"
+
+
+def table(rows: Sequence[Row], source: str) -> str:
+    """Markdown: a row for each variant. Errors are medians over the states, in per cent: median / 95th percentile / size of bias."""
+    first = rows[0]
+    states, asked = ", ".join(first["states"]), first["asked"]
+    titles = ("variant", "probes", "kB", "bake [core s]", "tick [us]", "of talk's", *STAGES.values())
+    lines = [
+        f"{source}, {len(first['sectors'])} sectors; medians over {states} of the median / 95th percentile / |bias| in per cent; "
+        f"{asked['points']} points of a kind and sector, {asked['samples']} paths. On the front of some price: *.",
+        "",
+        f"| {' | '.join(titles)} |",
+        "|---" * len(titles) + "|",
+    ]
+    on_front = {number for price in PRICES for number in pareto(rows, price)}
+    talk = next((row["tick_us"] for row in rows if row["variant"] == "talk"), None)
+    for number, row in enumerate(rows):
+        cells = [
+            row["variant"] + (" *" if number in on_front else ""),
+            f"{row['probes']:.0f}",
+            f"{row['bytes'] / 1e3:.0f}",
+            f"{row['bake_seconds']:.2f}",
+            f"{row['tick_us']:.0f}",
+            "" if talk is None else f"{row['tick_us'] / talk:.2f}",
+            *(_figures(error_of(row["states"], stage)) for stage in STAGES),
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def _figures(error: dict[str, float] | None) -> str:
+    return "" if error is None else f"{100 * error['median']:.1f} / {100 * error['p95']:.0f} / {100 * error['bias']:.1f}"
+
+
+def draw(rows: Sequence[Row], source: str) -> Image.Image:
+    """A panel for each price: median error on surfaces against it, both logarithmic, the front joined by a line; numbers name variants."""
+    legend = 24 + LEGEND_ROW * math.ceil(len(rows) / len(PRICES))
+    image = Image.new("RGB", (PANEL[0] * len(PRICES), PANEL[1] + legend), "white")
+    pen = ImageDraw.Draw(image)
+    for panel, (price, (label, scale)) in enumerate(PRICES.items()):
+        _draw_panel(pen, panel * PANEL[0], rows, price, label, scale)
+    pen.text(
+        (MARGIN[0], 12), f"{source}: median error of shaded points, median over states; the line joins what nothing beats", fill="black"
+    )
+    for number, row in enumerate(rows):
+        column, line = divmod(number, math.ceil(len(rows) / len(PRICES)))
+        at = (column * PANEL[0] + MARGIN[0], PANEL[1] + 8 + line * LEGEND_ROW)
+        pen.text(at, f"{number + 1:2d}  {row['variant']}", fill=PRESET_COLOURS.get(row["preset"], "black"))
+    return image
+
+
+def _draw_panel(pen: ImageDraw.ImageDraw, left: int, rows: Sequence[Row], price: str, label: str, scale: float) -> None:
+    prices, errors = [row[price] * scale for row in rows], [100 * row["error"]["median"] for row in rows]
+    x_of, y_of = _axis(prices, left + MARGIN[0], left + PANEL[0] - MARGIN[2]), _axis(errors, PANEL[1] - MARGIN[3], MARGIN[1])
+    bottom, right = PANEL[1] - MARGIN[3], left + PANEL[0] - MARGIN[2]
+    for value in _ticks(errors):
+        pen.line([(left + MARGIN[0], y_of(value)), (right, y_of(value))], fill="#dddddd")
+        pen.text((left + MARGIN[0] - 6, y_of(value)), f"{value:g} %", fill="black", anchor="rm")
+    for value in _ticks(prices):
+        pen.line([(x_of(value), MARGIN[1]), (x_of(value), bottom)], fill="#dddddd")
+        pen.text((x_of(value), bottom + 6), f"{value:g}", fill="black", anchor="ma")
+    pen.text(((left + MARGIN[0] + right) / 2, bottom + 22), label, fill="black", anchor="ma")
+    points = [(x_of(p), y_of(e)) for p, e in zip(prices, errors, strict=True)]
+    pen.line([points[i] for i in pareto(rows, price)], fill=FRONT, width=2)
+    for number, (x, y) in enumerate(points):
+        colour = PRESET_COLOURS.get(rows[number]["preset"], "black")
+        pen.ellipse([x - 4, y - 4, x + 4, y + 4], fill=colour)
+        pen.text((x + 6, y - 12), str(number + 1), fill=colour)
+
+
+def _axis(values: Sequence[float], start: float, end: float) -> Any:
+    """Where a value goes on a logarithmic axis that has a little room at both ends."""
+    low, high = (math.log(max(v, 1e-9)) for v in (min(values), max(values)))
+    room = max(0.08 * (high - low), 0.1)
+    return lambda value: start + (end - start) * (math.log(max(value, 1e-9)) - low + room) / (high - low + 2 * room)
+
+
+def _ticks(values: Sequence[float]) -> list[float]:
+    """Round numbers, 1 2 3 5 times a power of ten, within the values' range."""
+    low, high = max(min(values), 1e-9), max(values)
+    decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    return [
+        step * 10.0**decade for decade in decades for step in (1, 1.5, 2, 3, 4, 5, 7) if low * 0.95 <= step * 10.0**decade <= high * 1.05
+    ]
