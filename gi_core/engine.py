@@ -34,7 +34,7 @@ from gi_core.lights import lamps_digest, lamps_on
 from gi_core.relight import Relighter
 from gi_core.relight_input import relight_input
 from gi_core.resident_sector import ResidentSector
-from gi_core.rooms import find_room, nearest, rooms_of
+from gi_core.rooms import find_room, nearest, rooms_of, rooms_with_light
 from gi_core.sector import PROBE_IN_MARGIN
 from gi_core.settings import NEUTRAL, Settings
 from gi_core.sky_patches import face_exitance
@@ -228,7 +228,7 @@ class Engine:
 
         room : its name or number; None takes the room that the position lies in, or all rooms where it lies in none
 
-        Raises InputError for a room that there is none of, and where the volume reaches no voxel of it; else as ``volume``.
+        Raises InputError for a room that there is none of, and where the volume reaches no voxel or no probe of it; else as ``volume``.
         """
         rooms = self.dataset.world.rooms
         wanted = int(rooms_of(np.asarray(position)[None], rooms)[0]) if room is None else find_room(rooms, room)
@@ -240,25 +240,31 @@ class Engine:
             raise OutsideWorldError(self._outside(position))
         values = np.zeros((BASIS_SIZES[basis], *VOLUME_SHAPE, 3), np.float32)
         mask = np.full(VOLUME_SHAPE, VOXEL_NO_SECTOR, np.uint8)
+        lit_rooms = np.full(VOLUME_SHAPE, ROOM_OUTDOORS, np.uint16)
+        reached: set[int] = set()
         with self._lock:
             target = self._device.allocate(values.nbytes)
             for box in boxes:
                 sector = self._resident(box.index).sector
-                kind, is_room = box_mask(box, sector), box_rooms(box, sector)
-                inside = is_room == wanted if wanted else is_room != ROOM_OUTDOORS
-                kind[(kind == VOXEL_INDOORS) & ~inside] = VOXEL_SOLID
+                kind, room_here = box_mask(box, sector), box_rooms(box, sector, sector.voxel_room)
+                kind[(kind == VOXEL_INDOORS) & ~_in_room(room_here, wanted)] = VOXEL_SOLID
                 mask[box_slices(box)] = kind
-                if (kind == VOXEL_INDOORS).any() and sector.probe_count:
+                if not (kind == VOXEL_INDOORS).any():
+                    continue
+                reached.update(np.unique(room_here[kind == VOXEL_INDOORS]).tolist())
+                lit_rooms[box_slices(box)] = box_rooms(box, sector, rooms_with_light(sector))
+                if sector.probe_count:
                     resident = self._lit_resident(box.index, light)
                     grid = VoxelGrid(sector.voxel_first, sector.voxel_class, sector.voxel_probe, sector.voxel_weight)
                     ResidentGrid(self._device, grid).fill(box, target, resident.converted(basis), basis)
             self._device.read(target, values)
-        inside = mask == VOXEL_INDOORS
+        inside = _in_room(lit_rooms, wanted)
         if not inside.any():
             there = f"room {rooms[wanted - 1].name!r}" if wanted else "a room"
-            raise InputError(f"kind=interior: the volume around this place reaches no voxel of {there}; GET /v1/world lists rooms")
+            lacks = f"has no probe in {there}" if reached else f"reaches no voxel of {there}; GET /v1/world lists rooms"
+            raise InputError(f"kind=interior: the volume around this place {lacks}")
         values = np.ascontiguousarray(values[(slice(None), *nearest(inside))])
-        return Volume(values, mask, first, tuple(box.index for box in boxes), basis, room=wanted)
+        return Volume(values, mask, first, tuple(box.index for box in boxes), basis, rooms=tuple(sorted(reached)))
 
     def distant(self, lighting: Lighting) -> Distant:
         """One texel per sector of the whole world, lit by the sky alone (slide "Distant shading"). Raises CorruptFileError."""
@@ -368,6 +374,11 @@ class Engine:
         low, high = (", ".join(f"{v:.1f}" for v in corner) for corner in self.dataset.world.bounds)
         here = ", ".join(f"{v:g}" for v in position)
         return f"position ({here}) is outside this world; expected x, y, z [m] within ({low}) and ({high})"
+
+
+def _in_room(room: UInt16, wanted: int) -> Bool:
+    """Which of these rooms are the wanted one; of 0, any."""
+    return np.asarray(room == wanted if wanted else room != ROOM_OUTDOORS, np.bool_)
 
 
 def _fill_columns(values: Float32, has_light: Bool) -> None:

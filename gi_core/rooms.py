@@ -26,6 +26,17 @@ def outdoor_blend(sector: Sector) -> tuple[UInt16, Float32]:
     return sector.voxel_probe[source], sector.voxel_weight[source]
 
 
+def rooms_with_light(sector: Sector) -> UInt16:
+    """Rooms (ny, nz, nx) of a sector's voxels, where they blend probes of that room alone; else 0.
+
+    A room without a probe was baked to borrow from all, so its voxels may hold light of the street.
+    """
+    of_probe = sector.probe_room[sector.voxel_probe] if sector.probe_count else np.zeros_like(sector.voxel_probe)
+    foreign = (sector.voxel_weight > 0) & (of_probe != sector.voxel_room[..., None])
+    lit = sector.voxel_weight.any(axis=3) & ~foreign.any(axis=3)
+    return np.where(lit, sector.voxel_room, np.uint16(ROOM_OUTDOORS))
+
+
 def nearest(wanted: Bool) -> tuple[Int64, Int64, Int64]:
     """For each voxel the index (y, z, x) of the nearest that is wanted, itself where it is: three arrays of the shape of ``wanted``.
 

@@ -28,6 +28,8 @@ from server.encoding import (
 from server.server_timing import Laps
 
 router = APIRouter(prefix="/v1", tags=["light"])
+# What a header may tell of rooms: proxies take 8 kB of headers, and /v1/world has all of them.
+MAX_ROOMS_TOLD = 16
 
 
 @router.get("/volume", response_class=Response, responses={200: {"content": {media: {} for media in MEDIA_TYPE.values()}}})
@@ -127,10 +129,16 @@ def volume_facts(found: Volume, shape: tuple[int, ...], dtype: str, scale: float
         "expected_error": found.expected_error,
         "cascade": found.cascade,
     }
-    if found.room is not None:
-        chosen = enumerate(rooms, 1) if found.room == 0 else [(found.room, rooms[found.room - 1])]
-        facts["rooms"] = [{"number": n, "name": room.name, "minimum": room.minimum, "maximum": room.maximum} for n, room in chosen]
+    if found.rooms:
+        facts["rooms"] = [room_facts(rooms, number) for number in found.rooms[:MAX_ROOMS_TOLD]]
+        facts["rooms_reached"] = len(found.rooms)
     return facts
+
+
+def room_facts(rooms: tuple[Room, ...], number: int) -> dict[str, Any]:
+    """Where a room is, and what /v1/world calls it."""
+    room = rooms[number - 1]
+    return {"number": number, "name": room.name, "minimum": room.minimum, "maximum": room.maximum}
 
 
 def _as_texture(values: AnyArray) -> AnyArray:

@@ -4,6 +4,7 @@ The bound is the slides' own regret turned round: 0.1 % of the other side's ligh
 """
 
 import importlib.util
+import shutil
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
@@ -12,9 +13,11 @@ import numpy as np
 import pytest
 
 from bake_jobs.config import settings_for
+from gi_core import sector_file
 from gi_core.constants import VOXEL_INDOORS, VOXEL_OUTDOORS
-from gi_core.dataset import Dataset
+from gi_core.dataset import Dataset, sector_path
 from gi_core.engine import Engine
+from gi_core.errors import InputError
 from gi_core.volume import sample_volume
 from gi_core.world import Lamp, Location, Room
 
@@ -106,3 +109,23 @@ def test_day_does_not_darken_the_outside_of_a_dark_house(engine):
     assert (volume.mask == VOXEL_INDOORS).any()
     assert volume.values[:, volume.mask == VOXEL_INDOORS][..., 1].min() >= air.min()
     assert beside.min() > 0.2 * np.median(beside)
+
+
+def test_a_room_without_a_probe_does_not_show_the_light_that_it_borrowed(engine, tmp_path):
+    city = tmp_path / "city"
+    shutil.copytree(engine.dataset.path, city)
+    bake_id, basis_size = engine.dataset.world.bake_id, 6
+    for index in engine.dataset.world.sectors:
+        sector = engine.dataset.sector(index)
+        if (sector.voxel_room == 1).any():
+            borrowed = replace(sector, probe_room=np.where(sector.probe_room == 1, 0, sector.probe_room).astype(np.uint16))
+            sector_path(city, index).write_bytes(sector_file.encode(borrowed, {"bake_id": bake_id}, basis_size))
+    other = Engine(Dataset.open(city))
+    noon = other.lighting("12:00", "clear")
+    with pytest.raises(InputError, match="has no probe in room 'dark'"):
+        other.interior(np.array([28.0, 4.0, 32.0]), noon, room="dark")
+    # Of both rooms, the one that has light lends it.
+    both, lit = (other.interior(np.array([57.0, 4.0, 32.0]), noon, room=room) for room in (None, "lit"))
+    assert (both.rooms, lit.rooms) == ((1, 2), (2,))
+    np.testing.assert_array_equal(both.values, lit.values)
+    assert (both.mask == VOXEL_INDOORS).sum() > (lit.mask == VOXEL_INDOORS).sum()

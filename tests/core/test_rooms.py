@@ -6,7 +6,7 @@ from scipy.ndimage import distance_transform_edt
 
 from gi_core.constants import VOXEL_INDOORS, VOXEL_OUTDOORS, VOXEL_SOLID
 from gi_core.errors import InputError
-from gi_core.rooms import find_room, nearest, outdoor_blend, rooms_of
+from gi_core.rooms import find_room, nearest, outdoor_blend, rooms_of, rooms_with_light
 from gi_core.world import Room
 
 ROOMS = (Room("hall", (0, 0, 0), (10, 4, 10)), Room("2", (8, 0, 8), (20, 4, 20)), Room("attic", (0, 4, 0), (10, 6, 10)))
@@ -54,3 +54,14 @@ def test_rooms_are_found_by_name_then_by_number():
 def test_where_rooms_overlap_the_first_one_counts():
     at = np.array([[9.0, 1, 9], [15, 1, 15], [5, 5, 5], [5, 9, 5]])
     assert rooms_of(at, ROOMS).tolist() == [1, 2, 3, 0]
+
+
+def test_a_room_s_light_is_what_its_own_probes_give_alone(make_sector):
+    sector = make_sector(7, probes=6, voxel_probes=2)
+    found = rooms_with_light(sector)
+    for place in np.ndindex(sector.voxel_room.shape):
+        room, weights = sector.voxel_room[place], sector.voxel_weight[place]
+        rooms = {sector.probe_room[p] for p, w in zip(sector.voxel_probe[place], weights, strict=True) if w > 0}
+        assert found[place] == (room if rooms == {room} else 0)
+    assert (found > 0).any()
+    assert not rooms_with_light(make_sector(7, probes=0)).any()
