@@ -9,7 +9,7 @@ import pyopencl as cl
 
 from gi_core.arrays import Bool, Float32, Float64, UInt8, UInt16
 from gi_core.basis import convert, served_from
-from gi_core.coarse_volume import CoarseSums, covered_sectors
+from gi_core.coarse_volume import CoarseSums, KeptCoarse, covered_sectors
 from gi_core.constants import (
     BASIS_SIZES,
     FINE_VOXEL_SIZE_M,
@@ -39,7 +39,7 @@ from gi_core.sector import PROBE_IN_MARGIN
 from gi_core.settings import NEUTRAL, Settings
 from gi_core.sky_patches import face_exitance
 from gi_core.user_sky import UserSky, lighting_with_sky
-from gi_core.volume import SectorBox, Volume, box_mask, box_record, box_rooms, box_slices, nearest_columns, plan_boxes, whole_record
+from gi_core.volume import SectorBox, Volume, box_mask, box_record, box_rooms, box_slices, nearest_columns, plan_boxes
 from gi_core.voxel_grid import ResidentGrid, VoxelGrid
 from gi_core.world import Lamp
 
@@ -103,6 +103,7 @@ class Engine:
         self._shadows = ShadowGeometry(dataset.geometry, dataset.world.sectors)
         self._lights: dict[SectorIndex, SurfelLights] = {}
         self._fine: dict[SectorIndex, ResidentGrid] = {}
+        self._coarse = KeptCoarse()
         self._lit: OrderedDict[tuple[str, Settings, SectorIndex], Float32] = OrderedDict()
 
     @property
@@ -207,11 +208,16 @@ class Engine:
         sectors = [index for index in covered_sectors(first, cascade) if index in self.dataset.world.sectors]
         if not sectors:
             raise OutsideWorldError(self._outside(position))
-        sums = CoarseSums(first, cascade, BASIS_SIZES[basis])
-        for index in sectors:
+        parts = {}
+        # Sectors on the device first: where not all fit, loading one would drop the next.
+        for index in sorted(sectors, key=lambda index: index not in self._residents):
             with self._lock:  # sector by sector: other queries wait for one, not for all
-                resident = self._lit_resident(index, light)
-                sums.add(resident.sector, self._all_voxels(resident, basis) if resident.sector.probe_count else None)
+                cubes = self._lit_sector(index, light)
+                parts[index] = self._coarse.get(index, cascade, lambda index: self._resident(index).sector), cubes
+        sums = CoarseSums(first, BASIS_SIZES[basis])
+        for index in sectors:
+            voxels, cubes = parts[index]
+            sums.add(voxels, convert(cubes, self.dataset.world.basis, basis))
         values, mask, has_light = sums.finish()
         _fill_columns(values, has_light)
         return Volume(values, mask, first, tuple(sectors), basis, self._expected_error(basis, cascade), cascade)
@@ -307,15 +313,6 @@ class Engine:
             resident.fill_volume(box_record(box, sector), size, target, resident.converted(basis), basis)
         mask[box_slices(box)] = box_mask(box, sector)
         return sector.probe_count > 0
-
-    def _all_voxels(self, resident: ResidentSector, basis: str) -> Float32:
-        """Light (B, ny, nz, nx, 3) [lx] of a sector's own voxels."""
-        ny, nz, nx = resident.sector.voxel_class.shape
-        values = np.zeros((BASIS_SIZES[basis], ny, nz, nx, 3), np.float32)
-        target = self._device.allocate(values.nbytes)
-        resident.fill_volume(whole_record(resident.sector), (nx, ny, nz), target, resident.converted(basis), basis)
-        self._device.read(target, values)
-        return values
 
     def _lit_resident(self, index: SectorIndex, light: _Light) -> ResidentSector:
         """A sector on the device, with its probes lit."""

@@ -133,15 +133,6 @@ def box_rooms(box: SectorBox, sector: Sector, voxel_room: UInt16) -> UInt16:
     return rooms
 
 
-def whole_record(sector: Sector) -> AnyArray:
-    """All of a sector's voxels, as a box of a volume that is just as large: (1,) layout.VOLUME_BOX."""
-    sy, sz, sx = sector.voxel_class.shape
-    record = np.zeros(1, VOLUME_BOX.dtype)
-    for name in ("box_size", "volume_size", "sector_size"):
-        record[name][0, :3] = (sx, sy, sz)
-    return record
-
-
 def box_slices(box: SectorBox) -> tuple[slice, slice, slice]:
     """Where a box lies in its volume's (y, z, x)."""
     (x, y, z), (nx, ny, nz) = box.volume_first.tolist(), box.size.tolist()
