@@ -195,7 +195,9 @@ class Engine:
             with self._lock:
                 resident = self._lit_resident(box.index, light)
                 if box.index not in self._fine:
-                    self._fine[box.index] = ResidentGrid(self._device, self.dataset.fine_voxels(resident.sector))
+                    self._fine[box.index] = ResidentGrid(
+                        self._device, self.dataset.fine_voxels(resident.sector).outdoors(resident.sector.probe_room)
+                    )
                 fine = self._fine[box.index]
                 target = self._device.allocate(values.nbytes)
                 fine.fill(box, target, resident.converted(basis), basis)

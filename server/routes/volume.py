@@ -47,7 +47,8 @@ def volume(request: Request, service: ServiceDep, query: Annotated[VolumeQuery, 
 
     `kind=outdoor`: no light of rooms; a voxel in one holds what the nearest one outdoors has. `kind=interior`: of a room alone; every other
     voxel holds what the nearest inside has, and `rooms` in the header places its box: inside it sample this volume, else the outdoor
-    one. `kind=fog`: outdoor light averaged over directions, (16, 32, 32, 3).
+    one; at an opening, mix(outdoor, interior, alpha) of `encoding=f16` has no step. `kind=fog`: outdoor light averaged
+    over directions, (16, 32, 32, 3).
     `cascade=1..3`: voxels of twice, four and eight times the size, means of those inside them; `-1`: of half the size, where `/v1/world`
     says so. Each cascade covers the middle of the next: blend from one to the other over the last two voxels of the smaller.
     `mask=1`: uint8 (16, 32, 32), 0 solid, 1 outdoors, 2 indoors, 3 no sector there. The header `Gi-Volume` places it in the world.
