@@ -134,7 +134,9 @@ class PreviewQuery(LightingQuery):
     look: Vector = Field(description="what it looks at, x,y,z [m]")
     fov: float = Field(60.0, ge=1, le=150, allow_inf_nan=False, description="horizontal angle [degrees]")
     width: int = Field(640, ge=16, le=MAX_PREVIEW_WIDTH, description="pixels; the height is 9/16 of it")
-    gi: Literal["on", "off", "split"] = Field("on", description="off: direct light only; split: left off, right on")
+    gi: Literal["on", "off", "split", "error"] = Field(
+        "on", description="off: direct light only; split: left off, right on; error: against a path tracer, in false colour"
+    )
 
     @model_validator(mode="after")
     def _has_direction(self) -> "PreviewQuery":

@@ -49,6 +49,13 @@ def city_radiance(
     engine: Engine, scene: PreviewScene, camera: Camera, lighting: Lighting, indirect: Indirect = "on", settings: Settings = NEUTRAL
 ) -> Float32:
     """``render`` with an engine's lamps and volumes, under the artists' settings. Raises CorruptFileError."""
+    lamps = settings.brightened(lamps_on(engine.lamps, lighting))
+    source = volume_source(engine, lighting, settings)
+    return render(camera, scene, settings.light(lighting), lamps, source, indirect, engine.dataset.world.rooms)
+
+
+def volume_source(engine: Engine, lighting: Lighting, settings: Settings = NEUTRAL) -> VolumeAt:
+    """An engine's volumes under one light. Calling it raises CorruptFileError."""
     low, high = engine.dataset.world.bounds
 
     def volume_at(position: Float64, room: int) -> Volume:
@@ -59,8 +66,7 @@ def city_radiance(
         except InputError:  # a closet between voxels, of which no light is known
             return engine.volume(inside, lighting, settings)
 
-    lamps = settings.brightened(lamps_on(engine.lamps, lighting))
-    return render(camera, scene, settings.light(lighting), lamps, volume_at, indirect, engine.dataset.world.rooms)
+    return volume_at
 
 
 def render(
