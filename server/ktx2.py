@@ -1,7 +1,9 @@
 """3D textures as KTX 2.0 files: no mipmaps, no supercompression (Khronos, "KTX File Format Specification", version 2.0).
 
-A volume of six faces is laid out as bevy loads an irradiance volume: Rx wide, 2 Ry high, 3 Rz deep. Along the height come the negative
-faces, then the positive ones; along the depth those of X, Y and Z.
+A volume of six faces is laid out as bevy reads an irradiance volume: Rx wide, 2 Ry high, 3 Rz deep. Along the height come the positive
+faces, then the negative ones; along the depth those of X, Y and Z. So bevy's shader has it (irradiance_volume.wgsl, 0.13 to 0.20: half of
+the height further where the normal's component is negative), and Blender's Eevee, from whose files bevy's own come. The text in
+bevy's irradiance_volume.rs has the halves the other way round: read so, floors would be lit by what comes from below.
 """
 
 import math
@@ -15,6 +17,8 @@ from gi_core.arrays import AnyArray
 
 IDENTIFIER = b"\xabKTX 20\xbb\r\n\x1a\n"
 WRITER = "Sectorlight"
+# Of the texture's axes: x to the right (east), y up, z out of the picture (south).
+ORIENTATION = "ruo"
 _HEADER = struct.Struct("<9I4I2Q3Q")
 _RGBSDA, _BT709, _LINEAR = 1, 1, 1  # colour model, primaries and transfer function of the data format descriptor
 _SIGNED_FLOAT, _EXPONENT = 0xC0, 0x20
@@ -54,7 +58,7 @@ def texture_file(data: bytes, size: tuple[int, int, int], kind: TexelFormat, fac
     depth, height, width = size
     assert len(data) == depth * height * width * kind.texel_bytes
     descriptor = _descriptor(kind)
-    pairs = b"".join(_pair(key, value) for key, value in sorted({**facts, "KTXwriter": WRITER}.items()))
+    pairs = b"".join(_pair(key, value) for key, value in sorted({**facts, "KTXorientation": ORIENTATION, "KTXwriter": WRITER}.items()))
     descriptor_at = len(IDENTIFIER) + _HEADER.size
     pairs_at = descriptor_at + len(descriptor)
     alignment = math.lcm(kind.texel_bytes, 4)
@@ -72,7 +76,7 @@ def texture_file(data: bytes, size: tuple[int, int, int], kind: TexelFormat, fac
 def stacked_faces(faces: AnyArray) -> AnyArray:
     """Faces +X -X +Y -Y +Z -Z (6, y, z, x, ...) as one texture (3 z, 2 y, x, ...)."""
     _, ny, nz, nx, *rest = faces.shape
-    by_axis = faces.reshape(3, 2, ny, nz, nx, *rest)[:, ::-1]  # axis, sign from negative to positive, y, z, x
+    by_axis = faces.reshape(3, 2, ny, nz, nx, *rest)  # axis, sign from positive to negative, y, z, x
     return np.ascontiguousarray(np.moveaxis(by_axis, 3, 1)).reshape(3 * nz, 2 * ny, nx, *rest)
 
 

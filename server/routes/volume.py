@@ -37,8 +37,9 @@ def volume(request: Request, service: ServiceDep, query: Annotated[VolumeQuery, 
     `npy`: float32 (B, 16, 32, 32, 3) = coefficient, y, z, x, channel.
     `raw`: little-endian halves (B, 16, 32, 32, 4); lux = rgb x scale; alpha is 1 in the volume's own air, else 0. With `encoding=rgb9e5`,
     of the cube alone: words (6, 16, 32, 32) of three nine-bit mantissas and their exponent, a GPU's E5B9G9R9; lux = rgb x scale.
-    `ktx2`: the same texels of the cube as one 3D texture, 32 wide, 2 x 16 high (negative faces, then positive), 3 x 32 deep (X, Y, Z):
-    bevy's irradiance volume. The file's key `Gi-Volume` repeats the header.
+    `ktx2`: the same texels of the cube as one 3D texture, 32 wide, 2 x 16 high (positive faces, then negative), 3 x 32 deep (X, Y, Z):
+    as bevy's shader reads an irradiance volume (its documentation has the halves the other way round), whose `intensity` is then
+    scale / pi. The file's key `Gi-Volume` repeats the header.
     `basis=cube`: B = 6 faces +X -X +Y -Y +Z -Z. `sh1`, `sh2`: B = 4, 9 of real spherical harmonics in the order 1, y, z, x, xy, yz,
     3z^2-1, xz, x^2-y^2, of either sign; irradiance along a normal is their sum, each times its harmonic there.
 

@@ -88,10 +88,37 @@ def read_ktx2(data: bytes) -> dict[str, Any]:
 
 
 def face_of(texture: np.ndarray, axis: int, positive: bool) -> np.ndarray:
-    """A face (y, z, x, ...) of bevy's texture (3 Rz, 2 Ry, Rx, ...)."""
+    """A face (y, z, x, ...) of bevy's texture (3 Rz, 2 Ry, Rx, ...): the half further along the height is the negative one."""
     ny, nz, _ = VOLUME_SHAPE
-    part = texture[axis * nz : (axis + 1) * nz, positive * ny : (positive + 1) * ny]
+    part = texture[axis * nz : (axis + 1) * nz, (not positive) * ny : (1 + (not positive)) * ny]
     return np.swapaxes(part, 0, 1)
+
+
+def bevy_light(texture: np.ndarray, voxel: tuple[int, int, int], normal: np.ndarray) -> np.ndarray:
+    """Light (3,) at a voxel (x, y, z) along a normal, in texture coordinates as bevy's irradiance_volume.wgsl works them out."""
+    atlas = np.array(texture.shape[2::-1], float)  # textureDimensions: width, height, depth
+    uvw = (np.array(voxel) + 0.5) / atlas
+    total = np.zeros(3)
+    for axis in range(3):
+        at = uvw + np.array([0.0, 0.5 if normal[axis] < 0 else 0.0, axis / 3])
+        x, y, z = np.floor(at * atlas).astype(int)
+        total += normal[axis] ** 2 * texture[z, y, x, :3]
+    return total
+
+
+def test_bevy_s_shader_finds_the_light_that_the_cube_has(http: httpx.Client, noon: Place) -> None:
+    cube = array(get(http, noon)[0])
+    content, facts, _ = get(http, noon, format="ktx2")
+    texture = np.frombuffer(read_ktx2(content)["data"], "<f2").reshape(96, 32, 32, 4).astype(float) * facts["scale"]
+    rng = np.random.default_rng(4)
+    for _ in range(50):
+        voxel = tuple(int(rng.integers(count)) for count in (32, 16, 32))
+        normal = rng.normal(size=3)
+        normal /= np.linalg.norm(normal)
+        x, y, z = voxel
+        expected = sum(normal[axis] ** 2 * cube[2 * axis + (normal[axis] < 0), y, z, x] for axis in range(3))
+        # rtol 2^-11: rounding of a half
+        np.testing.assert_allclose(bevy_light(texture, voxel, normal), expected, rtol=2**-11, atol=2**-25 * facts["scale"])
 
 
 def test_ktx2_holds_the_raw_halves_where_bevy_reads_them(http: httpx.Client, noon: Place) -> None:
@@ -111,6 +138,7 @@ def test_ktx2_holds_the_raw_halves_where_bevy_reads_them(http: httpx.Client, noo
     for face in range(6):
         np.testing.assert_array_equal(face_of(texture, face // 2, face % 2 == 0), halves[face])
     assert json.loads(file["pairs"]["Gi-Volume"]) == described
+    assert (file["pairs"]["KTXwriter"], file["pairs"]["KTXorientation"]) == ("Sectorlight", "ruo")
     assert described["scale"] == facts["scale"]
     assert described["shape"] == [96, 32, 32, 4]
 
