@@ -172,7 +172,7 @@ def _measure(
         "variant": variant.name,
         "preset": variant.preset,
         "knobs": list(variant.knobs),
-        "asked": _asked(sweep, variant),
+        "asked": asked(sweep, variant),
         "basis": world.basis,
         "sectors": [[index.x, index.z] for index in chosen],
         "probes": float(np.mean([f.probes for f in facts])),
@@ -203,7 +203,7 @@ def pareto(rows: Sequence[dict[str, Any]], price: str) -> list[int]:
     return front
 
 
-def _asked(sweep: Sweep, variant: Variant) -> dict[str, Any]:
+def asked(sweep: Sweep, variant: Variant) -> dict[str, Any]:
     """What decides a row's figures: a row of anything else is not this one's."""
     settings = settings_for(variant.preset)
     judged = {"states": list(sweep.states), "points": sweep.points, "samples": sweep.samples, "seed": sweep.seed}
@@ -218,4 +218,4 @@ def _finished(path: Path, sweep: Sweep, variant: Variant) -> dict[str, Any] | No
         Dataset.open(path.parents[1] / "datasets" / variant.folder)
     except (OSError, ValueError):
         return None
-    return row if isinstance(row, dict) and row.get("asked") == _asked(sweep, variant) else None
+    return row if isinstance(row, dict) and row.get("asked") == asked(sweep, variant) else None
