@@ -2,7 +2,7 @@
 
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from rich.console import Console
@@ -11,6 +11,7 @@ from bake_jobs.runner import SectorRange
 from bake_jobs.scene_source import load_scene
 from bake_jobs.tradeoff import Sweep, Variant, middle_block, plan, run
 from bake_jobs.tradeoff_report import draw, table
+from bake_jobs.tradeoff_serve import Encoding, with_serving
 from gi_core.container import write_atomic
 from gi_core.errors import InputError
 
@@ -27,6 +28,7 @@ def sweep(
     jobs: int,
     restart: bool,
     device: str | None,
+    encodings: Mapping[str, Encoding],
 ) -> None:
     """Run a sweep, leave ``tradeoff.md``, ``tradeoff.json`` and ``tradeoff.png`` beside its rows and datasets, and print the table.
 
@@ -43,6 +45,7 @@ def sweep(
             status.update(f"{variants.index(variant) + 1} of {len(variants)}, {variant.name}: {what}")
 
         rows = run(task, variants, output, jobs or None, device, restart, show)
+        rows = with_serving(task, variants, rows, output, encodings, device, restart, show)
     name = Path(source).name
     picture = io.BytesIO()
     draw(rows, name).save(picture, "PNG")

@@ -163,7 +163,7 @@ def compare_dataset(
     dark: list[str] = []
 
     for number, index in enumerate(chosen):
-        points = choose_points(tracer.rays, dataset.geometry(index), dataset.sector(index), points_per_sector, _rng(seed, index))
+        points = points_of(tracer, dataset, index, points_per_sector, seed)
         for place, (state, lighting) in enumerate(lightings.items()):
             volume = engine.volume(points.eye, lighting)
             if place == 0:
@@ -171,7 +171,7 @@ def compare_dataset(
                 air["open"] += int(open_air.sum())
                 air["called_solid"] += int((open_air & (volume.mask < VOXEL_OUTDOORS)).sum())
             stages = found[state]
-            shining, rng = lamps_on(engine.lamps, lighting), _rng(seed, index, lighting.digest)
+            shining, rng = lamps_on(engine.lamps, lighting), sector_rng(seed, index, lighting.digest)
             reference = Reference(tracer, lighting, shining, samples, rng, world.basis, known)
             lit = engine.lit_sector(index, lighting)[points.probe]
             stages["probes"].add(_six_faces(lit, world.basis), reference.cubes(points.probe_position))
@@ -243,7 +243,12 @@ def _tracer(dataset: Dataset, chosen: Sequence[SectorIndex], scene: Scene | None
     )
 
 
-def _rng(seed: int, index: SectorIndex, digest: str = "") -> np.random.Generator:
+def points_of(tracer: PathTracer, dataset: Dataset, index: SectorIndex, count: int, seed: int) -> SectorPoints:
+    """Where a sector is compared."""
+    return choose_points(tracer.rays, dataset.geometry(index), dataset.sector(index), count, sector_rng(seed, index))
+
+
+def sector_rng(seed: int, index: SectorIndex, digest: str = "") -> np.random.Generator:
     """The same for a sector, and lighting, whatever else is compared."""
     key = (index.x & 0xFFFFFFFF, index.z & 0xFFFFFFFF, int(digest[:8] or "0", 16))
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))

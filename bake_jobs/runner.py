@@ -33,7 +33,18 @@ from bake_jobs.sector_job import SectorBaker
 from bake_jobs.summary import print_summary
 from gi_core import distant_file, fine_file, geometry_file, sector_file
 from gi_core.container import write_atomic
-from gi_core.dataset import COUNTS, DISTANT_FILE, WORLD_FILE, SectorFacts, WorldInfo, fine_path, geometry_path, sector_path, write_world
+from gi_core.dataset import (
+    COUNTS,
+    DISTANT_FILE,
+    WORLD_FILE,
+    Dataset,
+    SectorFacts,
+    WorldInfo,
+    fine_path,
+    geometry_path,
+    sector_path,
+    write_world,
+)
 from gi_core.errors import FormatError, InputError, SectorlightError
 from gi_core.grid import SectorIndex
 from gi_core.json_fields import LARGEST_INTEGER
@@ -121,6 +132,7 @@ def bake(
     remaining = [i for i in wanted if i not in done]
     if done:
         console.print(f"{len(done)} of {len(wanted)} sectors are finished already; baking the other {len(remaining)}")
+    report = _report_of(output, bake_id, wanted)
     workers = max(1, min(jobs or os.cpu_count() or 1, len(remaining)))
     started = time.perf_counter()
     if remaining:
@@ -166,6 +178,7 @@ def bake(
         rooms=scene.rooms,
         lamps=scene.lamps,
         dropped_triangles=asdict(scene.dropped),
+        error_report=report,
     )
     with _writing(output):
         write_atomic(output / DISTANT_FILE, distant_file.encode(texels, bake_id))
@@ -206,6 +219,15 @@ def _clear(output: Path) -> None:
         shutil.rmtree(output / name, ignore_errors=True)
     for name in (WORLD_FILE, DISTANT_FILE):
         (output / name).unlink(missing_ok=True)
+
+
+def _report_of(output: Path, bake_id: str, wanted: list[SectorIndex]) -> dict[str, Any] | None:
+    """What ``compare`` measured of this very bake when it had these very sectors, or None."""
+    try:
+        world = Dataset.open(output).world
+    except (InputError, FormatError):
+        return None
+    return world.error_report if world.bake_id == bake_id and set(world.sectors) == set(wanted) else None
 
 
 def _facts(sector_bytes: bytes, geometry_bytes: int, fine_bytes: int | None, meta: dict[str, Any]) -> SectorFacts:

@@ -34,10 +34,10 @@ BLOCK = 2  # sectors along each side when none are named
 # Of BASELINE, one at a time.
 KNOBS: dict[str, tuple[str, ...]] = {
     "rays": ("rays_per_face_edge=8", "rays_per_face_edge=24"),
-    "cells": ("cells_double_beyond_m=4", "cells_double_beyond_m=16"),
+    "cells": ("cells_double_beyond_m=2", "cells_double_beyond_m=8", "cells_double_beyond_m=16"),
     "placement": ("placement=grid",),
     "spacing": ("probe_worth=0.03", "probe_worth=0.003", "target_error=0.05", "target_error=0.02"),
-    "sky": ("sky=faces", "sky_patches=24", "sky_patches=96"),
+    "sky": ("sky=faces", "sky_patches=24", "sky_patches=48"),
     "feedback": ("feedback_probes=3",),
     "basis": ("basis=cube", "basis=sh1"),
     "voxels": ("voxel_weights=nearest", "voxel_probes=2", "voxel_levels=2"),
@@ -83,7 +83,7 @@ def plan(names: Sequence[str] = ()) -> list[Variant]:
     unknown = [name for name in names if name not in known]
     if unknown:
         raise InputError(
-            f"--variants {unknown[0][:60]!r}: expected some of {', '.join((*PRESETS, *KNOBS))}, or a knob as in sky_patches=96"
+            f"--variants {unknown[0][:60]!r}: expected some of {', '.join((*PRESETS, *KNOBS))}, or a knob as in sky_patches=48"
         )
     return [variant for group, variant in everything if not names or {group, *variant.knobs} & set(names)]
 
@@ -172,7 +172,7 @@ def _measure(
         "variant": variant.name,
         "preset": variant.preset,
         "knobs": list(variant.knobs),
-        "asked": _asked(sweep, variant),
+        "asked": asked(sweep, variant),
         "basis": world.basis,
         "sectors": [[index.x, index.z] for index in chosen],
         "probes": float(np.mean([f.probes for f in facts])),
@@ -203,7 +203,7 @@ def pareto(rows: Sequence[dict[str, Any]], price: str) -> list[int]:
     return front
 
 
-def _asked(sweep: Sweep, variant: Variant) -> dict[str, Any]:
+def asked(sweep: Sweep, variant: Variant) -> dict[str, Any]:
     """What decides a row's figures: a row of anything else is not this one's."""
     settings = settings_for(variant.preset)
     judged = {"states": list(sweep.states), "points": sweep.points, "samples": sweep.samples, "seed": sweep.seed}
@@ -218,4 +218,4 @@ def _finished(path: Path, sweep: Sweep, variant: Variant) -> dict[str, Any] | No
         Dataset.open(path.parents[1] / "datasets" / variant.folder)
     except (OSError, ValueError):
         return None
-    return row if isinstance(row, dict) and row.get("asked") == _asked(sweep, variant) else None
+    return row if isinstance(row, dict) and row.get("asked") == asked(sweep, variant) else None

@@ -48,7 +48,46 @@ def table(rows: Sequence[Row], source: str) -> str:
             *(_figures(error_of(row["states"], stage)) for stage in STAGES),
         ]
         lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, *_served(rows), *_bounces(rows)]) + "\n"
+
+
+def _served(rows: Sequence[Row]) -> list[str]:
+    """What a volume's basis and encoding trade; nothing where no row knows."""
+    served = [(row["variant"], way) for row in rows for way in row.get("served", ())]
+    cells = [
+        [
+            name,
+            w["basis"],
+            w["encoding"],
+            f"{w['bytes'] / 1e3:.0f}",
+            *(_percent(w[n], d) for n, d in (("median", 1), ("p95", 1), ("changed", 3))),
+        ]
+        for name, w in served
+    ]
+    titles = ("variant", "served as", "encoding", "kB a volume", "shaded", "p95", "changed")
+    said = (
+        "Serving: the basis and the encoding of a volume. changed: the 99th percentile of what the encoding alone does to a shaded point."
+    )
+    return ["", said, "", *_lines(titles, cells)] if cells else []
+
+
+def _bounces(rows: Sequence[Row]) -> list[str]:
+    """How fast light settles; nothing where no row knows."""
+    cells = [
+        (row["variant"], str(found["passes"]), _percent(found["median"], 1), _percent(found["p95"], 1), f"{found['microseconds']:.0f}")
+        for row in rows
+        for found in row.get("bounces", ())
+    ]
+    said = "Bounces: how far probes' faces are from where theirs end, so many passes after the light came on in the dark; a tick makes one."
+    return ["", said, "", *_lines(("variant", "passes", "median", "p95", "a sector [us]"), cells)] if cells else []
+
+
+def _lines(titles: Sequence[str], cells: Sequence[Sequence[str]]) -> list[str]:
+    return [f"| {' | '.join(titles)} |", "|---" * len(titles) + "|", *(f"| {' | '.join(row)} |" for row in cells)]
+
+
+def _percent(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{100 * value:.{digits}f} %"
 
 
 def _figures(error: dict[str, float] | None) -> str:

@@ -203,13 +203,14 @@ def tradeoff(
 ) -> None:
     """Bake a few sectors in many ways and show what each costs: error against bytes, bake seconds and tick microseconds."""
     from bake_jobs import cli_compare, cli_tradeoff
+    from server.encoded_light import ENCODINGS
 
     names = [name.strip() for name in variants.split(",") if name.strip()]
     chosen = None if sectors is None else parse_sectors(sectors)
     try:
         with writing(output):
             moments = cli_compare.split_states(states)
-            cli_tradeoff.sweep(source, output, names, chosen, moments, points, samples, seed, jobs, restart, device)
+            cli_tradeoff.sweep(source, output, names, chosen, moments, points, samples, seed, jobs, restart, device, ENCODINGS)
     except KeyboardInterrupt:
         fail("interrupted; finished variants are kept: the same command goes on from there", INTERRUPTED)
 

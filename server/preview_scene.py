@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gi_core.arrays import Float32, Float64
+from gi_core.arrays import Float32, Float64, Int32
 from gi_core.constants import SECTOR_SIZE_M
 from gi_core.dataset import Dataset
 from gi_core.grid import SectorIndex
@@ -16,6 +16,8 @@ from server.raycast import RayCaster
 MAX_SECTORS = 81
 # Pictures come in runs from about one place; two neighbouring places cover a viewer that walks.
 MAX_CACHED_SCENES = 2
+
+Mesh = tuple[Float64, Int32, Float32, Float32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,17 +45,24 @@ class PreviewScenes:
             self._scenes.popitem(last=False)
         return scene
 
+    @staticmethod
+    def mesh_around(dataset: Dataset, eye: Float64, look: Float64) -> Mesh:
+        """The triangles of ``around``: vertices (v, 3) [m], triangles (m, 3), albedo and emission (m, 3)."""
+        return _merged(dataset, plan_sectors(dataset.world.sectors, eye, look))
+
     def _load(self, sectors: tuple[SectorIndex, ...]) -> PreviewScene:
-        parts = [part for part in map(self._dataset.geometry, sectors) if len(part.triangles)]
-        if not parts:
-            return PreviewScene(None, np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32))
-        firsts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
-        triangles = np.concatenate([part.triangles + np.int32(first) for part, first in zip(parts, firsts, strict=True)])
-        return PreviewScene(
-            RayCaster(np.concatenate([part.vertices for part in parts]), triangles.astype(np.int32)),
-            np.concatenate([part.albedo for part in parts]),
-            np.concatenate([part.emission for part in parts]),
-        )
+        vertices, triangles, albedo, emission = _merged(self._dataset, sectors)
+        return PreviewScene(RayCaster(vertices, triangles) if len(triangles) else None, albedo, emission)
+
+
+def _merged(dataset: Dataset, sectors: tuple[SectorIndex, ...]) -> Mesh:
+    parts = [part for part in map(dataset.geometry, sectors) if len(part.triangles)]
+    if not parts:
+        return np.zeros((0, 3)), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)
+    firsts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
+    triangles = np.concatenate([part.triangles + np.int32(first) for part, first in zip(parts, firsts, strict=True)])
+    albedo, emission = (np.concatenate([getattr(part, name) for part in parts]) for name in ("albedo", "emission"))
+    return np.concatenate([part.vertices for part in parts]), triangles.astype(np.int32), albedo, emission
 
 
 def plan_sectors(available: Iterable[SectorIndex], eye: Float64, look: Float64) -> tuple[SectorIndex, ...]:

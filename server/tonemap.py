@@ -5,7 +5,7 @@ import io
 import numpy as np
 from PIL import Image
 
-from gi_core.arrays import AnyArray, Float32, UInt8
+from gi_core.arrays import Float32, UInt8
 from gi_core.spectrum import LUMINANCE_FROM_RGB
 
 # Saturation-based ISO speed (ISO 12232): the luminance that EV100 exposes to white is 1.2 x 2^EV100.
@@ -52,7 +52,11 @@ def developed(radiance: Float32, ev100: float) -> UInt8:
 
 def png(radiance: Float32, ev100: float) -> bytes:
     """A PNG of radiance (rows, columns, 3) [cd m^-2]; ``ev100`` suits what the sky lights."""
-    picture: AnyArray = developed(radiance, metered(radiance, ev100))
+    return png_file(developed(radiance, metered(radiance, ev100)))
+
+
+def png_file(picture: UInt8) -> bytes:
+    """A PNG of sRGB (rows, columns, 3)."""
     out = io.BytesIO()
     Image.fromarray(picture).save(out, "PNG", compress_level=6)
     return out.getvalue()

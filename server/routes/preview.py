@@ -10,7 +10,8 @@ from server.caching import Body, conditional, strong_etag
 from server.camera import Camera
 from server.dependencies import PreviewQuery, ServiceDep, parse_vector
 from server.encoding import REPLY_VERSION
-from server.preview import city_radiance
+from server.preview import Look, city_radiance
+from server.preview_error import error_picture
 from server.service import Service
 
 router = APIRouter(prefix="/v1", tags=["pictures"])
@@ -18,7 +19,13 @@ router = APIRouter(prefix="/v1", tags=["pictures"])
 
 @router.get("/preview.png", response_class=Response, responses={200: {"content": {"image/png": {}}}})
 def preview(request: Request, service: ServiceDep, query: Annotated[PreviewQuery, Query()]) -> Response:
-    """The city at a time and in a weather, lit directly by sun, moon and lamps, indirectly by the volumes that /v1/volume serves."""
+    """The city at a time and in a weather, lit directly by sun, moon and lamps, indirectly by the volumes that /v1/volume serves.
+
+    `gi=off`: direct light only; `split`: left off, right on; `error`: the indirect light's error against a path tracer in false colour
+    (blue: too dark, red: too bright, by half and more), which takes some seconds.
+    `distant`: beyond the volumes the texture of /v1/distant takes over (`on`), or not (`off`: the nearest volume's edge). A picture takes
+    as many volumes as its pixels need, up to 128; `client` shows what one has who holds only the volume around the eye.
+    """
     light = service.lighting(query.time, query.weather)
     etag = strong_etag("preview", REPLY_VERSION, service.light_identity, light.digest, query.model_dump(exclude={"time", "weather"}))
     return conditional(request, etag, lambda: Body(picture(service, query, light), "image/png"))
@@ -28,6 +35,8 @@ def picture(service: Service, query: PreviewQuery, light: Lighting) -> bytes:
     """The PNG that a query asks for."""
     camera = Camera(parse_vector(query.eye), parse_vector(query.look), query.fov, query.width)
     with service.preview_turn():
+        if query.gi == "error":
+            return tonemap.png_file(error_picture(service, camera, light))
         scene = service.preview_scenes.around(camera.eye, camera.look)
-        radiance = city_radiance(service.engine, scene, camera, light, query.gi)
+        radiance = city_radiance(service.engine, scene, camera, light, Look(query.gi, query.distant))
     return tonemap.png(radiance, light.exposure)

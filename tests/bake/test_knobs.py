@@ -17,12 +17,12 @@ def test_a_knob_changes_one_setting_and_the_name():
 
 def test_standard_is_the_talk_and_its_ideas():
     placed = ["placement=adaptive", "voxel_weights=fitted", "voxel_candidates=24", "margin_m=3.2"]
-    ideas = with_knobs(settings_for("talk"), ["basis=sh2", "sky=patches", *placed]).to_json()
+    ideas = with_knobs(settings_for("talk"), ["basis=sh2", "sky=patches", "sky_patches=96", "cells_double_beyond_m=4", *placed]).to_json()
     assert settings_for("standard").to_json() | {"preset": ""} == ideas | {"preset": ""}
 
 
 def test_reference_is_standard_and_more_of_it():
-    more = with_knobs(settings_for("standard"), ["sky_patches=96", "probe_worth=0.001", "voxel_levels=2"]).to_json()
+    more = with_knobs(settings_for("standard"), ["cells_double_beyond_m=8", "probe_worth=0.001", "voxel_levels=2"]).to_json()
     assert settings_for("reference").to_json() | {"preset": ""} == more | {"preset": ""}
 
 

@@ -1,5 +1,6 @@
 """The bake as a whole: the same bytes however it is run, and nothing lost when it is cut off."""
 
+import dataclasses
 import os
 import resource
 import signal
@@ -13,7 +14,7 @@ from rich.console import Console
 
 from bake_jobs import runner
 from bake_jobs.runner import DatasetWriteError, bake
-from gi_core.dataset import Dataset
+from gi_core.dataset import Dataset, write_world
 from gi_core.errors import InputError, SourceError
 from gi_core.grid import SectorIndex
 
@@ -322,3 +323,25 @@ def test_a_target_error_is_estimated_for_every_sector_and_misses_are_named(sourc
     for index, estimate in estimates.items():
         assert (f"{index.x},{index.z} ({100 * estimate:.1f} %)" in text) == (estimate > 0.001)
     assert "estimated error" in text
+
+
+def test_the_same_bake_once_more_keeps_its_error_report_and_any_other_drops_it(source, tmp_path):
+    def reported(report):
+        write_world(tmp_path, dataclasses.replace(Dataset.open(tmp_path).world, error_report=report))
+
+    def report():
+        return Dataset.open(tmp_path).world.error_report
+
+    measured = {"expected_error": 0.05, "states": {}}
+    run(source, tmp_path)
+    reported(measured)
+    kept = (tmp_path / "world.json").read_bytes()
+    run(source, tmp_path)
+    assert (tmp_path / "world.json").read_bytes() == kept
+    run(source, tmp_path, sectors=((0, 2), (0, 1)))
+    assert report() is None  # it was measured in sectors that are no longer there
+    for options in ({"seed": 1}, {"restart": True}):
+        run(source, tmp_path)
+        reported(measured)
+        run(source, tmp_path, **options)
+        assert report() is None

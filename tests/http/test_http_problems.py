@@ -38,7 +38,7 @@ BAD: list[tuple[str, dict[str, str], str]] = [
     ("/v1/preview.png", {"time": "12:00", "weather": "clear", "eye": "1,2", "look": "0,0,0"}, "eye"),
     ("/v1/preview.png", {"time": "12:00", "weather": "clear", "eye": "1,2,3", "look": "1,2,3"}, "look"),
     ("/v1/preview.png", {"time": "12:00", "weather": "clear", "eye": "1,2,3", "look": "0,0,0", "width": "100000"}, "width"),
-    ("/v1/preview.png", {"time": "12:00", "weather": "clear", "eye": "1,2,3", "look": "0,0,0", "gi": "error"}, "gi"),
+    ("/v1/preview.png", {"time": "12:00", "weather": "clear", "eye": "1,2,3", "look": "0,0,0", "gi": "wrong"}, "gi"),
 ]
 
 
