@@ -9,7 +9,7 @@ import pyopencl as cl
 
 from gi_core.arrays import Bool, Float32, Float64, UInt8, UInt16
 from gi_core.basis import convert, served_from
-from gi_core.coarse_volume import CoarseSums, covered_sectors
+from gi_core.coarse_volume import CoarseSums, KeptCoarse, covered_sectors
 from gi_core.constants import (
     BASIS_SIZES,
     FINE_VOXEL_SIZE_M,
@@ -34,12 +34,12 @@ from gi_core.lights import lamps_digest, lamps_on
 from gi_core.relight import Relighter
 from gi_core.relight_input import relight_input
 from gi_core.resident_sector import ResidentSector
-from gi_core.rooms import find_room, nearest, rooms_of
+from gi_core.rooms import find_room, nearest, rooms_of, rooms_with_light
 from gi_core.sector import PROBE_IN_MARGIN
 from gi_core.settings import NEUTRAL, Settings
 from gi_core.sky_patches import face_exitance
 from gi_core.user_sky import UserSky, lighting_with_sky
-from gi_core.volume import SectorBox, Volume, box_mask, box_record, box_rooms, box_slices, nearest_columns, plan_boxes, whole_record
+from gi_core.volume import SectorBox, Volume, box_mask, box_record, box_rooms, box_slices, nearest_columns, plan_boxes
 from gi_core.voxel_grid import ResidentGrid, VoxelGrid
 from gi_core.world import Lamp
 
@@ -103,6 +103,7 @@ class Engine:
         self._shadows = ShadowGeometry(dataset.geometry, dataset.world.sectors)
         self._lights: dict[SectorIndex, SurfelLights] = {}
         self._fine: dict[SectorIndex, ResidentGrid] = {}
+        self._coarse = KeptCoarse()
         self._lit: OrderedDict[tuple[str, Settings, SectorIndex], Float32] = OrderedDict()
 
     @property
@@ -194,7 +195,9 @@ class Engine:
             with self._lock:
                 resident = self._lit_resident(box.index, light)
                 if box.index not in self._fine:
-                    self._fine[box.index] = ResidentGrid(self._device, self.dataset.fine_voxels(resident.sector))
+                    self._fine[box.index] = ResidentGrid(
+                        self._device, self.dataset.fine_voxels(resident.sector).outdoors(resident.sector.probe_room)
+                    )
                 fine = self._fine[box.index]
                 target = self._device.allocate(values.nbytes)
                 fine.fill(box, target, resident.converted(basis), basis)
@@ -207,11 +210,16 @@ class Engine:
         sectors = [index for index in covered_sectors(first, cascade) if index in self.dataset.world.sectors]
         if not sectors:
             raise OutsideWorldError(self._outside(position))
-        sums = CoarseSums(first, cascade, BASIS_SIZES[basis])
-        for index in sectors:
+        parts = {}
+        # Sectors on the device first: where not all fit, loading one would drop the next.
+        for index in sorted(sectors, key=lambda index: index not in self._residents):
             with self._lock:  # sector by sector: other queries wait for one, not for all
-                resident = self._lit_resident(index, light)
-                sums.add(resident.sector, self._all_voxels(resident, basis) if resident.sector.probe_count else None)
+                cubes = self._lit_sector(index, light)
+                parts[index] = self._coarse.get(index, cascade, lambda index: self._resident(index).sector), cubes
+        sums = CoarseSums(first, BASIS_SIZES[basis])
+        for index in sectors:
+            voxels, cubes = parts[index]
+            sums.add(voxels, convert(cubes, self.dataset.world.basis, basis))
         values, mask, has_light = sums.finish()
         _fill_columns(values, has_light)
         return Volume(values, mask, first, tuple(sectors), basis, self._expected_error(basis, cascade), cascade)
@@ -228,7 +236,7 @@ class Engine:
 
         room : its name or number; None takes the room that the position lies in, or all rooms where it lies in none
 
-        Raises InputError for a room that there is none of, and where the volume reaches no voxel of it; else as ``volume``.
+        Raises InputError for a room that there is none of, and where the volume reaches no voxel or no probe of it; else as ``volume``.
         """
         rooms = self.dataset.world.rooms
         wanted = int(rooms_of(np.asarray(position)[None], rooms)[0]) if room is None else find_room(rooms, room)
@@ -240,25 +248,31 @@ class Engine:
             raise OutsideWorldError(self._outside(position))
         values = np.zeros((BASIS_SIZES[basis], *VOLUME_SHAPE, 3), np.float32)
         mask = np.full(VOLUME_SHAPE, VOXEL_NO_SECTOR, np.uint8)
+        lit_rooms = np.full(VOLUME_SHAPE, ROOM_OUTDOORS, np.uint16)
+        reached: set[int] = set()
         with self._lock:
             target = self._device.allocate(values.nbytes)
             for box in boxes:
                 sector = self._resident(box.index).sector
-                kind, is_room = box_mask(box, sector), box_rooms(box, sector)
-                inside = is_room == wanted if wanted else is_room != ROOM_OUTDOORS
-                kind[(kind == VOXEL_INDOORS) & ~inside] = VOXEL_SOLID
+                kind, room_here = box_mask(box, sector), box_rooms(box, sector, sector.voxel_room)
+                kind[(kind == VOXEL_INDOORS) & ~_in_room(room_here, wanted)] = VOXEL_SOLID
                 mask[box_slices(box)] = kind
-                if (kind == VOXEL_INDOORS).any() and sector.probe_count:
+                if not (kind == VOXEL_INDOORS).any():
+                    continue
+                reached.update(np.unique(room_here[kind == VOXEL_INDOORS]).tolist())
+                lit_rooms[box_slices(box)] = box_rooms(box, sector, rooms_with_light(sector))
+                if sector.probe_count:
                     resident = self._lit_resident(box.index, light)
                     grid = VoxelGrid(sector.voxel_first, sector.voxel_class, sector.voxel_probe, sector.voxel_weight)
                     ResidentGrid(self._device, grid).fill(box, target, resident.converted(basis), basis)
             self._device.read(target, values)
-        inside = mask == VOXEL_INDOORS
+        inside = _in_room(lit_rooms, wanted)
         if not inside.any():
             there = f"room {rooms[wanted - 1].name!r}" if wanted else "a room"
-            raise InputError(f"kind=interior: the volume around this place reaches no voxel of {there}; GET /v1/world lists rooms")
+            lacks = f"has no probe in {there}" if reached else f"reaches no voxel of {there}; GET /v1/world lists rooms"
+            raise InputError(f"kind=interior: the volume around this place {lacks}")
         values = np.ascontiguousarray(values[(slice(None), *nearest(inside))])
-        return Volume(values, mask, first, tuple(box.index for box in boxes), basis, room=wanted)
+        return Volume(values, mask, first, tuple(box.index for box in boxes), basis, rooms=tuple(sorted(reached)))
 
     def distant(self, lighting: Lighting) -> Distant:
         """One texel per sector of the whole world, lit by the sky alone (slide "Distant shading"). Raises CorruptFileError."""
@@ -301,15 +315,6 @@ class Engine:
             resident.fill_volume(box_record(box, sector), size, target, resident.converted(basis), basis)
         mask[box_slices(box)] = box_mask(box, sector)
         return sector.probe_count > 0
-
-    def _all_voxels(self, resident: ResidentSector, basis: str) -> Float32:
-        """Light (B, ny, nz, nx, 3) [lx] of a sector's own voxels."""
-        ny, nz, nx = resident.sector.voxel_class.shape
-        values = np.zeros((BASIS_SIZES[basis], ny, nz, nx, 3), np.float32)
-        target = self._device.allocate(values.nbytes)
-        resident.fill_volume(whole_record(resident.sector), (nx, ny, nz), target, resident.converted(basis), basis)
-        self._device.read(target, values)
-        return values
 
     def _lit_resident(self, index: SectorIndex, light: _Light) -> ResidentSector:
         """A sector on the device, with its probes lit."""
@@ -368,6 +373,11 @@ class Engine:
         low, high = (", ".join(f"{v:.1f}" for v in corner) for corner in self.dataset.world.bounds)
         here = ", ".join(f"{v:g}" for v in position)
         return f"position ({here}) is outside this world; expected x, y, z [m] within ({low}) and ({high})"
+
+
+def _in_room(room: UInt16, wanted: int) -> Bool:
+    """Which of these rooms are the wanted one; of 0, any."""
+    return np.asarray(room == wanted if wanted else room != ROOM_OUTDOORS, np.bool_)
 
 
 def _fill_columns(values: Float32, has_light: Bool) -> None:

@@ -23,7 +23,7 @@ class Volume:
     sectors : those that it was filled from
     expected_error : median relative error that the dataset's error report gives, or None without a report
     cascade : its voxels are VOXEL_SIZE_M times 2 to this
-    room : of an interior volume, the room's number, or 0 for all rooms: its mask says VOXEL_INDOORS there and nowhere else; None outdoors
+    rooms : numbers of the rooms that an interior volume reaches: its mask says VOXEL_INDOORS there and nowhere else; none outdoors
     """
 
     values: Float32
@@ -33,7 +33,7 @@ class Volume:
     basis: str = "cube"
     expected_error: float | None = None
     cascade: int = 0
-    room: int | None = None
+    rooms: tuple[int, ...] = ()
 
     @property
     def origin(self) -> Float64:
@@ -53,7 +53,7 @@ class Volume:
     @property
     def own(self) -> Bool:
         """(16, 32, 32): voxels of the air that the volume is of; what all others hold was taken from the nearest of these."""
-        return np.asarray(self.mask == (VOXEL_OUTDOORS if self.room is None else VOXEL_INDOORS), np.bool_)
+        return np.asarray(self.mask == (VOXEL_INDOORS if self.rooms else VOXEL_OUTDOORS), np.bool_)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,21 +125,12 @@ def box_mask(box: SectorBox, sector: Sector) -> UInt8:
     return mask
 
 
-def box_rooms(box: SectorBox, sector: Sector) -> UInt16:
-    """Rooms (y, z, x) of a box's voxels; what lies below what a sector stores is in none."""
+def box_rooms(box: SectorBox, sector: Sector, voxel_room: UInt16) -> UInt16:
+    """Rooms (y, z, x) of a box's voxels, from those of a sector's; what lies below what a sector stores is in none."""
     y, z, x = sector_slices(box, sector)
-    rooms: UInt16 = np.take(sector.voxel_room[:, z, x], y, axis=0)
+    rooms: UInt16 = np.take(voxel_room[:, z, x], y, axis=0)
     rooms[: max(int(sector.voxel_first[1] - box.lattice_first[1]), 0)] = ROOM_OUTDOORS
     return rooms
-
-
-def whole_record(sector: Sector) -> AnyArray:
-    """All of a sector's voxels, as a box of a volume that is just as large: (1,) layout.VOLUME_BOX."""
-    sy, sz, sx = sector.voxel_class.shape
-    record = np.zeros(1, VOLUME_BOX.dtype)
-    for name in ("box_size", "volume_size", "sector_size"):
-        record[name][0, :3] = (sx, sy, sz)
-    return record
 
 
 def box_slices(box: SectorBox) -> tuple[slice, slice, slice]:

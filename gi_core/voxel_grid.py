@@ -1,6 +1,6 @@
 """Voxels that blend a sector's probes, beside those of the sector itself: the fine ones, and those of its rooms."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pyopencl as cl
@@ -9,6 +9,7 @@ from gi_core.arrays import Float32, Int32, UInt8, UInt16
 from gi_core.constants import BASIS_SIZES
 from gi_core.device import Device
 from gi_core.resident_sector import VOXEL_GROUP
+from gi_core.rooms import without_rooms
 from gi_core.volume import SectorBox, lattice_record
 
 
@@ -26,6 +27,11 @@ class VoxelGrid:
     kind: UInt8
     probe: UInt16
     weight: Float32
+
+    def outdoors(self, probe_room: UInt16) -> "VoxelGrid":
+        """The grid as an outdoor volume blends it, of probes in these rooms (P,)."""
+        probe, weight = without_rooms(self.kind, self.probe, self.weight, probe_room)
+        return replace(self, probe=probe, weight=weight)
 
 
 class ResidentGrid:

@@ -16,6 +16,7 @@ from gi_core.arrays import Float64
 from gi_core.errors import InputError
 from gi_core.json_fields import LARGEST_INTEGER
 from server.encoding import ArrayFormat, RawEncoding, VolumeFormat
+from server.preview_light import Beyond
 from server.service import Service
 
 # Beyond this float32 metres are coarser than a voxel's position needs, and no world reaches it.
@@ -137,6 +138,7 @@ class PreviewQuery(LightingQuery):
     gi: Literal["on", "off", "split", "error"] = Field(
         "on", description="off: direct light only; split: left off, right on; error: against a path tracer, in false colour"
     )
+    distant: Beyond = Field("on", description="beyond the volumes: the distant texture, or off; client: beyond the eye's one volume")
 
     @model_validator(mode="after")
     def _has_direction(self) -> "PreviewQuery":

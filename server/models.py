@@ -99,6 +99,7 @@ class LimitsReply(BaseModel):
 
 
 class RoomReply(BaseModel):
+    number: int = Field(description="from 1; probes and interior volumes name rooms so")
     name: str
     minimum: Vector3
     maximum: Vector3

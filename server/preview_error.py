@@ -14,9 +14,10 @@ from PIL import Image, ImageDraw, ImageFont
 from gi_core.arrays import Float32, Float64, UInt8
 from gi_core.lighting import Lighting
 from gi_core.lights import lamps_on
+from gi_core.settings import NEUTRAL
 from gi_core.spectrum import LUMINANCE_FROM_RGB
 from server.camera import Camera
-from server.preview import indirect_irradiance, volume_source
+from server.preview_light import ServedLight
 from server.preview_scene import PreviewScenes
 from server.service import Service
 
@@ -40,8 +41,8 @@ def error_picture(service: Service, camera: Camera, lighting: Lighting) -> UInt8
         hit = np.flatnonzero(surface.hit)
         if len(hit):
             position, normal = surface.position[hit], surface.normal[hit]
-            source, rooms = volume_source(service.engine, lighting), service.dataset.world.rooms
-            served = indirect_irradiance(position, normal, source, rooms) @ LUMINANCE_FROM_RGB
+            light = ServedLight.of(service.engine, lighting, NEUTRAL, "on", camera.eye)
+            served = light.irradiance(position, normal) @ LUMINANCE_FROM_RGB
             error[hit] = relative_error(served, _traced(service, camera, lighting, position, normal))
     picture = Image.fromarray(false_colour(error.reshape(coarse.height, coarse.width)))
     return _with_legend(picture.resize((camera.width, camera.height), Image.Resampling.NEAREST), error)

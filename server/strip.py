@@ -75,7 +75,7 @@ def sheet(engine: Engine, scenes: PreviewScenes, camera: Camera, frames: list[Fr
     fine = Camera(camera.eye, camera.look, camera.fov_degrees, camera.width * SAMPLES)
 
     def radiance(frame: Frame, settings: Settings) -> Float32:
-        return reduced(city_radiance(engine, scene, fine, engine.lighting(frame.time, frame.weather), "on", settings), camera.height)
+        return reduced(city_radiance(engine, scene, fine, engine.lighting(frame.time, frame.weather), settings=settings), camera.height)
 
     cells = [_cell(frame, radiance, engine.lighting(frame.time, frame.weather).exposure) for frame in _shown(frames)]
     height, width = cells[0].shape[:2]

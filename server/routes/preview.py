@@ -10,7 +10,7 @@ from server.caching import Body, conditional, strong_etag
 from server.camera import Camera
 from server.dependencies import PreviewQuery, ServiceDep, parse_vector
 from server.encoding import REPLY_VERSION
-from server.preview import city_radiance
+from server.preview import Look, city_radiance
 from server.preview_error import error_picture
 from server.service import Service
 
@@ -23,6 +23,8 @@ def preview(request: Request, service: ServiceDep, query: Annotated[PreviewQuery
 
     `gi=off`: direct light only; `split`: left off, right on; `error`: the indirect light's error against a path tracer in false colour
     (blue: too dark, red: too bright, by half and more), which takes some seconds.
+    `distant`: beyond the volumes the texture of /v1/distant takes over (`on`), or not (`off`: the nearest volume's edge). A picture takes
+    as many volumes as its pixels need, up to 128; `client` shows what one has who holds only the volume around the eye.
     """
     light = service.lighting(query.time, query.weather)
     etag = strong_etag("preview", REPLY_VERSION, service.light_identity, light.digest, query.model_dump(exclude={"time", "weather"}))
@@ -36,5 +38,5 @@ def picture(service: Service, query: PreviewQuery, light: Lighting) -> bytes:
         if query.gi == "error":
             return tonemap.png_file(error_picture(service, camera, light))
         scene = service.preview_scenes.around(camera.eye, camera.look)
-        radiance = city_radiance(service.engine, scene, camera, light, query.gi)
+        radiance = city_radiance(service.engine, scene, camera, light, Look(query.gi, query.distant))
     return tonemap.png(radiance, light.exposure)

@@ -28,6 +28,8 @@ from server.encoding import (
 from server.server_timing import Laps
 
 router = APIRouter(prefix="/v1", tags=["light"])
+# What a header may tell of rooms: proxies take 8 kB of headers, and /v1/world has all of them.
+MAX_ROOMS_TOLD = 16
 
 
 @router.get("/volume", response_class=Response, responses={200: {"content": {media: {} for media in MEDIA_TYPE.values()}}})
@@ -45,9 +47,10 @@ def volume(request: Request, service: ServiceDep, query: Annotated[VolumeQuery, 
 
     `kind=outdoor`: no light of rooms; a voxel in one holds what the nearest one outdoors has. `kind=interior`: of a room alone; every other
     voxel holds what the nearest inside has, and `rooms` in the header places its box: inside it sample this volume, else the outdoor
-    one. `kind=fog`: outdoor light averaged over directions, (16, 32, 32, 3).
+    one; at an opening, mix(outdoor, interior, alpha) of `encoding=f16` has no step. `kind=fog`: outdoor light averaged
+    over directions, (16, 32, 32, 3).
     `cascade=1..3`: voxels of twice, four and eight times the size, means of those inside them; `-1`: of half the size, where `/v1/world`
-    says so. Each cascade covers the middle of the next: blend from one to the other over the last voxels of the smaller.
+    says so. Each cascade covers the middle of the next: blend from one to the other over the last two voxels of the smaller.
     `mask=1`: uint8 (16, 32, 32), 0 solid, 1 outdoors, 2 indoors, 3 no sector there. The header `Gi-Volume` places it in the world.
     """
     laps = Laps()
@@ -127,10 +130,16 @@ def volume_facts(found: Volume, shape: tuple[int, ...], dtype: str, scale: float
         "expected_error": found.expected_error,
         "cascade": found.cascade,
     }
-    if found.room is not None:
-        chosen = enumerate(rooms, 1) if found.room == 0 else [(found.room, rooms[found.room - 1])]
-        facts["rooms"] = [{"number": n, "name": room.name, "minimum": room.minimum, "maximum": room.maximum} for n, room in chosen]
+    if found.rooms:
+        facts["rooms"] = [room_facts(rooms, number) for number in found.rooms[:MAX_ROOMS_TOLD]]
+        facts["rooms_reached"] = len(found.rooms)
     return facts
+
+
+def room_facts(rooms: tuple[Room, ...], number: int) -> dict[str, Any]:
+    """Where a room is, and what /v1/world calls it."""
+    room = rooms[number - 1]
+    return {"number": number, "name": room.name, "minimum": room.minimum, "maximum": room.maximum}
 
 
 def _as_texture(values: AnyArray) -> AnyArray:

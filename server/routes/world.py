@@ -51,7 +51,7 @@ def world_reply(info: WorldInfo, digest: str) -> WorldReply:
         bases=list(served_from(info.basis)),
         kinds=["outdoor", "fog", *(["interior"] if info.rooms else [])],
         cascades=list(range(-1 if info.has_fine_voxels else 0, MAX_CASCADE + 1)),
-        rooms=[RoomReply(name=room.name, minimum=room.minimum, maximum=room.maximum) for room in info.rooms],
+        rooms=[RoomReply(number=n, name=r.name, minimum=r.minimum, maximum=r.maximum) for n, r in enumerate(info.rooms, 1)],
         limits=LimitsReply(probe_radius_m=MAX_PROBE_RADIUS_M, preview_width=MAX_PREVIEW_WIDTH, probes_per_sector=MAX_PROBES_PER_SECTOR),
         dataset={
             "digest": digest,

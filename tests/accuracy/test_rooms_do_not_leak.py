@@ -4,6 +4,7 @@ The bound is the slides' own regret turned round: 0.1 % of the other side's ligh
 """
 
 import importlib.util
+import shutil
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
@@ -12,9 +13,11 @@ import numpy as np
 import pytest
 
 from bake_jobs.config import settings_for
+from gi_core import sector_file
 from gi_core.constants import VOXEL_INDOORS, VOXEL_OUTDOORS
-from gi_core.dataset import Dataset
+from gi_core.dataset import Dataset, sector_path
 from gi_core.engine import Engine
+from gi_core.errors import InputError
 from gi_core.volume import sample_volume
 from gi_core.world import Lamp, Location, Room
 
@@ -22,7 +25,13 @@ WALL_M = 0.1
 DARK = Room("dark", (20.0, 0.1, 20.0), (36.0, 8.0, 44.0))
 LIT = Room("lit", (36.1, 0.1, 20.0), (52.0, 8.0, 44.0))  # wall to wall with the dark one
 LEAK = 1e-3
-QUICK = {"rays_per_face_edge": 8, "grid_spacing_m": 6.0, "wall_spacing_m": 8.0, "sun_declination_step_degrees": 40.0}
+QUICK = {
+    "rays_per_face_edge": 8,
+    "grid_spacing_m": 6.0,
+    "wall_spacing_m": 8.0,
+    "sun_declination_step_degrees": 40.0,
+    "voxel_levels": 2,
+}
 NIGHT_LAMP = Lamp("bulb", "point", (44.0, 6.0, 32.0), 20_000.0, (1.0, 1.0, 1.0), 40.0)
 
 
@@ -89,11 +98,12 @@ def test_a_lit_room_does_not_light_the_street_or_the_room_next_door(engine):
     assert lit.min() > 5
     dark = seen(engine.interior(np.array([28.0, 4.0, 32.0]), night, room="dark"), "dark")
     assert dark.max() <= LEAK * np.median(lit)
-    engine.lamps = ()
-    without = seen(engine.volume(np.array([57.0, 2.0, 32.0]), night), "east")
-    engine.lamps = (NIGHT_LAMP,)
-    outside = seen(engine.volume(np.array([57.0, 2.0, 32.0]), night), "east")
-    np.testing.assert_allclose(outside, without, atol=LEAK * np.median(lit))
+    for cascade in (-1, 0, 1):
+        engine.lamps = ()
+        without = seen(engine.volume(np.array([57.0, 2.0, 32.0]), night, cascade=cascade), "east")
+        engine.lamps = (NIGHT_LAMP,)
+        outside = seen(engine.volume(np.array([57.0, 2.0, 32.0]), night, cascade=cascade), "east")
+        np.testing.assert_allclose(outside, without, atol=LEAK * np.median(lit))
 
 
 def test_day_does_not_darken_the_outside_of_a_dark_house(engine):
@@ -106,3 +116,23 @@ def test_day_does_not_darken_the_outside_of_a_dark_house(engine):
     assert (volume.mask == VOXEL_INDOORS).any()
     assert volume.values[:, volume.mask == VOXEL_INDOORS][..., 1].min() >= air.min()
     assert beside.min() > 0.2 * np.median(beside)
+
+
+def test_a_room_without_a_probe_does_not_show_the_light_that_it_borrowed(engine, tmp_path):
+    city = tmp_path / "city"
+    shutil.copytree(engine.dataset.path, city)
+    bake_id, basis_size = engine.dataset.world.bake_id, 6
+    for index in engine.dataset.world.sectors:
+        sector = engine.dataset.sector(index)
+        if (sector.voxel_room == 1).any():
+            borrowed = replace(sector, probe_room=np.where(sector.probe_room == 1, 0, sector.probe_room).astype(np.uint16))
+            sector_path(city, index).write_bytes(sector_file.encode(borrowed, {"bake_id": bake_id}, basis_size))
+    other = Engine(Dataset.open(city))
+    noon = other.lighting("12:00", "clear")
+    with pytest.raises(InputError, match="has no probe in room 'dark'"):
+        other.interior(np.array([28.0, 4.0, 32.0]), noon, room="dark")
+    # Of both rooms, the one that has light lends it.
+    both, lit = (other.interior(np.array([57.0, 4.0, 32.0]), noon, room=room) for room in (None, "lit"))
+    assert (both.rooms, lit.rooms) == ((1, 2), (2,))
+    np.testing.assert_array_equal(both.values, lit.values)
+    assert (both.mask == VOXEL_INDOORS).sum() > (lit.mask == VOXEL_INDOORS).sum()

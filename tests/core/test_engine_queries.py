@@ -60,8 +60,8 @@ def everything(engine: Engine, query: tuple[str, float, float, tuple[str, str]])
     """The bytes of one query's whole answer."""
     kind, x, z, moment = query
     position, light = np.array([x, 2.0, z]), engine.lighting(*moment)
-    if kind == "volume":
-        volume = engine.volume(position, light)
+    if kind in ("volume", "coarse volume"):
+        volume = engine.volume(position, light, cascade=0 if kind == "volume" else 2)
         return volume.values.tobytes() + volume.mask.tobytes() + repr((volume.sectors, volume.first_voxel.tolist())).encode()
     if kind == "probes":
         probes = engine.probes(position, 30.0, light)
@@ -71,7 +71,7 @@ def everything(engine: Engine, query: tuple[str, float, float, tuple[str, str]])
 
 QUERIES = [
     (kind, x, z, moment)
-    for kind in ("volume", "probes", "distant")
+    for kind in ("volume", "coarse volume", "probes", "distant")
     for x, z in ((5.0, 30.0), (-40.0, 10.0), (60.0, 60.0))
     for moment in (NOON, EVENING)
 ]

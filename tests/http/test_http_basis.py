@@ -12,7 +12,7 @@ import pytest
 
 from bake_jobs import runner
 from bake_jobs.config import settings_for
-from gi_core.basis import convert, evaluate
+from gi_core.basis import convert, evaluate, evaluation_weights
 from gi_core.constants import VOLUME_SHAPE
 from server.app import create_app
 from server.settings import Settings
@@ -105,3 +105,30 @@ def test_texels_without_a_sign_are_the_cube_s_alone(angled: httpx.Client) -> Non
     assert (facts["shape"], facts["dtype"], len(cube.content)) == ([6, *VOLUME_SHAPE], "rgb9e5", 4 * 6 * 16 * 32 * 32)
     refused = angled.get("/v1/volume", params={**raw, "basis": "sh2"})
     assert (refused.status_code, "rgb9e5" in refused.json()["detail"]) == (400, True)
+
+
+def test_fog_of_harmonics_is_their_mean_over_directions(angled: httpx.Client) -> None:
+    harmonics, _ = volume(angled, basis="sh2")
+    fog, facts = volume(angled, kind="fog")
+    assert (facts["basis"], facts["shape"]) == ("average", [*VOLUME_SHAPE, 3])
+    rng = np.random.default_rng(5)
+    voxels = [tuple(rng.integers(0, VOLUME_SHAPE)) for _ in range(4)]
+    directions = rng.normal(size=(100_000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    for place in voxels:
+        found = evaluation_weights("sh2", directions) @ harmonics[(slice(None), *place)].astype(float)
+        # Monte Carlo: four standard errors
+        np.testing.assert_allclose(fog[place], found.mean(axis=0), atol=4 * found.std() / np.sqrt(len(directions)))
+
+
+def test_cascades_are_had_in_every_basis(angled: httpx.Client) -> None:
+    harmonics, facts = volume(angled, basis="sh2", cascade="1")
+    assert (harmonics.shape, facts["voxel_size"], facts["basis"]) == ((9, *VOLUME_SHAPE, 3), [6.25] * 3, "sh2")
+    np.testing.assert_array_equal(volume(angled, basis="sh1", cascade="1")[0], harmonics[:4])
+    np.testing.assert_allclose(volume(angled, kind="fog", cascade="1")[0], harmonics[0] * np.float32(np.sqrt(1 / (4 * np.pi))), rtol=1e-6)
+    cube, _ = volume(angled, basis="cube", cascade="1")
+    faces = convert(np.moveaxis(harmonics.reshape(9, -1, 3), 0, 1), "sh2", "cube")
+    blended = np.moveaxis(cube.reshape(6, -1, 3), 0, 1)
+    # As of cascade 0: faces are cut off at 0 before they are blended.
+    assert (blended >= faces * (1 - 1e-4) - 1e-3 * faces.max()).all()
+    assert np.median(np.abs(blended - faces) / faces.mean()) < 1e-4

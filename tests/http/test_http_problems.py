@@ -27,6 +27,7 @@ BAD: list[tuple[str, dict[str, str], str]] = [
     ("/v1/volume", {**GOOD, "cascade": "4"}, "cascade"),
     ("/v1/volume", {**GOOD, "kind": "indoor"}, "'outdoor', 'interior' or 'fog'"),
     ("/v1/volume", {**GOOD, "mask": "maybe"}, "mask"),
+    ("/v1/volume", {**GOOD, "kind": "interior", "room": ""}, "or a number of 1 to"),
     ("/v1/volume", {**GOOD, "fromat": "raw"}, "fromat"),
     ("/v1/world", {"verbose": "1"}, "verbose"),
     ("/healthz", {"x": "1"}, "x"),
@@ -95,11 +96,35 @@ def test_problems_are_not_cached(http: httpx.Client) -> None:
     assert http.get("/v1/volume", params={**GOOD, "weather": "plague"}).headers["cache-control"] == "no-store"
 
 
-NAMES = ["time", "weather", "x", "y", "z", "radius", "format", "encoding", "mask", "eye", "look", "fov", "gi", "cascade", "basis", "room"]
+NAMES = [
+    "time",
+    "weather",
+    "x",
+    "y",
+    "z",
+    "radius",
+    "format",
+    "encoding",
+    "mask",
+    "eye",
+    "look",
+    "fov",
+    "gi",
+    "cascade",
+    "basis",
+    "room",
+    "kind",
+]
 NUMBERS = st.floats().map(str) | st.integers().map(str)
 TIMES = st.times().map(str) | st.datetimes().map(lambda moment: moment.isoformat())
 WEATHERS = st.builds("{}:{}".format, st.sampled_from(["clear", "snow", "fog"]), NUMBERS | st.text(max_size=8))
-VALUES = NUMBERS | TIMES | WEATHERS | st.text(max_size=30) | st.sampled_from(["clear", "12:00", "npy", "raw", "f16", "on", "0,5,9", "1"])
+VALUES = (
+    NUMBERS
+    | TIMES
+    | WEATHERS
+    | st.text(max_size=30)
+    | st.sampled_from(["clear", "12:00", "npy", "raw", "ktx2", "exr", "f16", "rgb9e5", "on", "0,5,9", "1", "-1", "3", "interior", "fog"])
+)
 ROUTES = ["/v1/volume", "/v1/lighting", "/v1/sky", "/v1/distant", "/v1/probes", "/v1/preview.png", "/v1/world", "/v1/sectors", "/readyz"]
 
 
@@ -110,7 +135,10 @@ def test_no_query_is_our_failure(http: httpx.Client, path: str, query: dict[str,
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True)
-@given(path=st.sampled_from(["/v1/volume", "/v1/probes"]), changes=st.dictionaries(st.sampled_from(NAMES[:9]), VALUES, max_size=2))
+@given(
+    path=st.sampled_from(["/v1/volume", "/v1/probes"]),
+    changes=st.dictionaries(st.sampled_from([*NAMES[:9], *NAMES[-4:]]), VALUES, max_size=2),
+)
 def test_no_almost_good_query_is_our_failure(http: httpx.Client, path: str, changes: dict[str, str]) -> None:
     assert http.get(path, params=_encodable({**GOOD, **changes})).status_code < 500
 

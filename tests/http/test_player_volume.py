@@ -33,7 +33,7 @@ def settled(live_http: httpx.Client, player: str) -> Iterator[str]:
 def test_a_settled_volume_is_the_query_s(live_http: httpx.Client, settled: str, street: tuple[float, float, float]) -> None:
     x, y, z = street
     query = {"time": NOON, "weather": SUNLESS, "x": x, "y": y, "z": z}
-    for parameters in ({}, {"mask": 1}, {"format": "raw"}):
+    for parameters in ({}, {"mask": 1}, {"format": "raw"}, {"format": "ktx2"}, {"format": "ktx2", "encoding": "rgb9e5"}):
         live = live_http.get(f"/v1/players/{settled}/volume", params=parameters)
         asked = live_http.get("/v1/volume", params=query | parameters)
         facts, expected = json.loads(live.headers["gi-volume"]), json.loads(asked.headers["gi-volume"])

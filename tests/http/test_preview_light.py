@@ -12,6 +12,7 @@ from server.camera import Camera
 from server.preview import render
 from server.preview_air import mean_sky, plain_distance, through_fog
 from server.preview_lamps import PixelCells, draw_lamps, lamp_irradiance
+from server.preview_light import ServedLight
 from server.preview_scene import PreviewScene
 from server.raycast import RayCaster
 
@@ -47,7 +48,7 @@ def drawn(camera: Camera, lamps: tuple[Lamp, ...], lighting: Lighting, irradianc
             self.voxel_size = np.full(3, VOXEL_SIZE_M)
 
     scene = PreviewScene(rays(), np.full((4, 3), ALBEDO, np.float32), np.zeros((4, 3), np.float32))
-    return render(camera, scene, lighting, lamps, Served, "on")
+    return render(camera, scene, lighting, lamps, ServedLight(Served))
 
 
 @pytest.mark.parametrize("at", [0.0, 50_000.0])

@@ -1,7 +1,6 @@
 """What a picture is made of: rays, shadows, volumes that cover it, exposure. Known answers, no city needed."""
 
 import io
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -14,8 +13,9 @@ from gi_core.lighting import DirectionalLight, Lighting
 from gi_core.world import Room
 from server import tonemap
 from server.camera import Camera
-from server.preview import MAX_VOLUMES, indirect_irradiance, indirect_pixels, plan_volumes, render
+from server.preview import Look, indirect_pixels, render
 from server.preview_air import background
+from server.preview_light import MAX_VOLUMES, ServedLight, plan_volumes
 from server.preview_scene import MAX_SECTORS, PreviewScene, plan_sectors
 from server.raycast import RayCaster
 
@@ -82,7 +82,7 @@ def test_the_camera_may_look_straight_down() -> None:
     assert (directions[:, 1] < -0.7).all()
 
 
-def served(values: np.ndarray) -> Callable[..., object]:
+def served(values: np.ndarray) -> ServedLight:
     class Served:
         """What a volume's readers use of it."""
 
@@ -91,7 +91,7 @@ def served(values: np.ndarray) -> Callable[..., object]:
             self.origin = voxel_centre(volume_first_voxel(position))
             self.voxel_size = np.full(3, VOXEL_SIZE_M)
 
-    return Served
+    return ServedLight(Served)
 
 
 def one_scene(albedo: float) -> PreviewScene:
@@ -103,12 +103,12 @@ def test_a_picture_adds_direct_and_served_light_by_lambert_s_law() -> None:
     uniform = np.full((6, *VOLUME_SHAPE, 3), 300.0, np.float32)
     camera = Camera(np.array([10.0, 8.0, 0.0]), np.array([10.0, 0.0, 0.001]), 30.0, 16)
     lighting = light((0, 1, 0), 1000.0, 50.0)
-    on = render(camera, one_scene(0.5), lighting, (), served(uniform), "on")
-    off = render(camera, one_scene(0.5), lighting, (), served(uniform), "off")
+    on = render(camera, one_scene(0.5), lighting, (), served(uniform), Look("on"))
+    off = render(camera, one_scene(0.5), lighting, (), served(uniform), Look("off"))
     # rtol 1e-4: float32 normals and cosines
     np.testing.assert_allclose(on, 0.5 / np.pi * 1300, rtol=1e-4)
     np.testing.assert_allclose(off, 0.5 / np.pi * 1000, rtol=1e-4)
-    split = render(camera, one_scene(0.5), lighting, (), served(uniform), "split")
+    split = render(camera, one_scene(0.5), lighting, (), served(uniform), Look("split"))
     np.testing.assert_array_equal(split[:, :8], off[:, :8])
     np.testing.assert_array_equal(split[:, 8:], on[:, 8:])
 
@@ -117,14 +117,16 @@ def test_the_face_that_a_surface_turns_to_lights_it() -> None:
     faces = np.zeros((6, *VOLUME_SHAPE, 3), np.float32)
     faces[3] = 700.0  # -Y: light from below
     below = Camera(np.array([-10.0, 5.0, 0.0]), np.array([-10.0, 10.0, 0.001]), 30.0, 16)
-    picture = render(below, one_scene(0.5), light((0, 1, 0), 0.0, 0.0), (), served(faces), "on")
+    picture = render(below, one_scene(0.5), light((0, 1, 0), 0.0, 0.0), (), served(faces), Look("on"))
     np.testing.assert_allclose(picture, 0.5 / np.pi * 700, rtol=1e-4)
 
 
 def test_emission_needs_no_light() -> None:
     scene = PreviewScene(floor_with_roof(0.0), np.zeros((4, 3), np.float32), np.full((4, 3), 12.0, np.float32))
     camera = Camera(np.array([10.0, 8.0, 0.0]), np.array([10.0, 0.0, 0.001]), 30.0, 16)
-    np.testing.assert_array_equal(render(camera, scene, light((0, 1, 0), 0.0, 0.0), (), served(np.zeros((6, 16, 32, 32, 3))), "off"), 12.0)
+    np.testing.assert_array_equal(
+        render(camera, scene, light((0, 1, 0), 0.0, 0.0), (), served(np.zeros((6, 16, 32, 32, 3))), Look("off")), 12.0
+    )
 
 
 def test_the_background_is_the_sky_and_an_open_plain() -> None:
@@ -228,11 +230,11 @@ def test_what_lies_in_a_room_reads_the_rooms_volume() -> None:
     def volume_at(position: np.ndarray, room: int) -> object:
         asked.append(room)
         values = np.full((6, 16, 32, 32, 3), 100.0 if room == 1 else 7.0, np.float32)
-        return served(values)(position, room)
+        return served(values).volume_at(position, room)
 
     hall = Room("hall", (0.0, 0.0, 0.0), (10.0, 4.0, 10.0))
     points = np.array([[5.0, 0.0, 5.0], [5.0, 4.0, 5.0], [10.1, 2.0, 5.0], [30.0, 0.0, 5.0]])
     normals = np.array([[0, 1, 0], [0, 1, 0], [1, 0, 0], [0, 1, 0]], np.float32)
-    light = indirect_irradiance(points, normals, volume_at, (hall,))
+    light = ServedLight(volume_at, rooms=(hall,)).irradiance(points, normals)
     np.testing.assert_allclose(light[:, 0], [100, 7, 7, 7], rtol=1e-6)  # the hall's floor, its roof, its wall from outside, the street
     assert sorted(set(asked)) == [0, 1]

@@ -10,6 +10,9 @@ import numpy as np
 import pytest
 
 from gi_core.constants import VOLUME_SHAPE
+from gi_core.volume import Volume
+from gi_core.world import Room
+from server.routes.volume import volume_facts
 
 Place = dict[str, Any]
 
@@ -229,6 +232,35 @@ def test_an_interior_is_of_one_room_alone(http: httpx.Client, noon: Place) -> No
     np.testing.assert_array_equal(texels[0, ..., 3], mask == 2)
     outdoors = np.frombuffer(get(http, inside, format="raw")[0], "<f2").reshape(6, *VOLUME_SHAPE, 4)
     np.testing.assert_array_equal(outdoors[0, ..., 3], both == 1)
+
+
+def test_a_header_tells_of_the_rooms_that_the_volume_reaches(http: httpx.Client, noon: Place) -> None:
+    """A header of a whole city's rooms would be megabytes."""
+    rooms = http.get("/v1/world").json()["rooms"]
+    assert [room["number"] for room in rooms] == list(range(1, len(rooms) + 1))
+    _, _, middle = room_in(http)
+    on_the_roof = {**noon, "x": middle[0], "y": middle[1] + 12, "z": middle[2]}
+    facts = get(http, on_the_roof, kind="interior")[1]
+    mask, told = array(get(http, on_the_roof, kind="interior", mask=1)[0]), facts["rooms"]
+    y, z, x = np.nonzero(mask == 2)
+    centre = np.array(facts["origin"]) + 3.125 * np.stack([x, y, z], axis=1)
+    reached = [r for r in rooms if ((centre >= r["minimum"]) & (centre <= r["maximum"])).all(axis=1).any()]
+    assert told == reached[:16]
+    assert facts["rooms_reached"] == len(reached) > 0
+
+
+def test_a_header_stays_small_whatever_the_world_has() -> None:
+    volume = Volume(
+        values=np.ones((6, *VOLUME_SHAPE, 3), np.float32),
+        mask=np.full(VOLUME_SHAPE, 2, np.uint8),
+        first_voxel=np.zeros(3, np.int64),
+        sectors=(),
+        rooms=tuple(range(1, 1001)),
+    )
+    rooms = tuple(Room(f"room {i}", (0, 0, 0), (1, 1, 1)) for i in range(1000))
+    facts = volume_facts(volume, volume.values.shape, "float32", 1.0, rooms)
+    assert [room["number"] for room in facts["rooms"]] == list(range(1, 17))
+    assert facts["rooms_reached"] == 1000
 
 
 def test_world_says_what_can_be_asked_for(http: httpx.Client) -> None:

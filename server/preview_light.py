@@ -1,0 +1,165 @@
+"""Served light as a picture reads it: volumes, and beyond them the texture of distant sectors (slide "Distant shading").
+
+    in a room              its interior volume
+    in a volume's box      the volume
+    up to FADE_M beyond    its edge, faded into the texture
+    farther                the texture alone
+
+A client has one volume, around its player; a picture may take as many as its pixels need.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from gi_core import ambient_cube
+from gi_core.ambient_cube import FACE_DIRECTIONS
+from gi_core.arrays import Float32, Float64, Int64
+from gi_core.basis import basis_of_size, evaluation_weights
+from gi_core.constants import ROOM_OUTDOORS, SECTOR_SIZE_M, VOLUME_SHAPE, VOXEL_SIZE_M
+from gi_core.engine import Distant, Engine
+from gi_core.errors import InputError
+from gi_core.lighting import Lighting
+from gi_core.rooms import rooms_of
+from gi_core.settings import Settings
+from gi_core.volume import Volume, sample_coefficients, sample_volume
+from gi_core.world import Room
+
+Beyond = Literal["on", "off", "client"]
+# The served volume around a place, of the room that a number says; 0 is outdoors.
+VolumeAt = Callable[[Float64, int], Volume]
+
+SAMPLE_OFFSET_M = VOXEL_SIZE_M / 4
+# Neighbouring volumes overlap by 4 voxels along each axis, so that every sample lies between voxel centres even after snapping.
+TILE_M = (np.array([VOLUME_SHAPE[2], VOLUME_SHAPE[0], VOLUME_SHAPE[1]]) - 4) * VOXEL_SIZE_M
+# From an outermost voxel's centre to the other side's.
+EXTENT_M = (np.array([VOLUME_SHAPE[2], VOLUME_SHAPE[0], VOLUME_SHAPE[1]]) - 1) * VOXEL_SIZE_M
+# The pixels that these do not cover are far away.
+MAX_VOLUMES = 128
+# Sampling holds some 300 bytes a point: 20 MB.
+SAMPLES_AT_ONCE = 1 << 16
+# A quarter of a volume's width: no line shows where the texture, which is flat over tens of metres, takes over.
+FADE_M = 25.0
+
+
+@dataclass(frozen=True, eq=False)
+class ServedLight:
+    """All that a picture knows of indirect light.
+
+    volume_at : the served volume around a world position (3,) [m], of a room or outdoors
+    distant : what lies beyond the volumes; None: their edge goes on for ever
+    player : (3,) [m], the one place that there is a volume around; None: as many as points need, at most MAX_VOLUMES
+    rooms : of the world; what lies in one reads its interior volume, and nothing beyond it
+    """
+
+    volume_at: VolumeAt
+    distant: Distant | None = None
+    player: Float64 | None = None
+    rooms: tuple[Room, ...] = ()
+
+    @classmethod
+    def of(cls, engine: Engine, lighting: Lighting, settings: Settings, beyond: Beyond, eye: Float64) -> "ServedLight":
+        """An engine's light under the artists' settings, seen from an eye (3,) [m]. Raises CorruptFileError."""
+        low, high = engine.dataset.world.bounds
+
+        def volume_at(position: Float64, room: int) -> Volume:
+            # A tile's centre may lie beyond the world's edge though its pixels do not.
+            inside = np.clip(position, low, high)
+            try:
+                return engine.interior(inside, lighting, settings, room=str(room)) if room else engine.volume(inside, lighting, settings)
+            except InputError:  # a closet between voxels, or out of the one volume's reach
+                return engine.volume(inside, lighting, settings)
+
+        distant = None if beyond == "off" else engine.distant(settings.light(lighting))
+        return cls(volume_at, distant, eye if beyond == "client" else None, engine.dataset.world.rooms)
+
+    def irradiance(self, position: Float64, normal: Float32) -> Float32:
+        """(n, 3) [lx] on surface points (n, 3) [m] with normals (n, 3), as a client samples it."""
+        # sample_volume reads this far off the surface, which may be the next volume's.
+        points = position + SAMPLE_OFFSET_M * normal
+        result = np.zeros((len(points), 3), np.float32)
+        for volume, some, near in self._parts(points):
+            result[some] = near[:, None] * sample_volume(volume.values, volume.origin, volume.voxel_size, position[some], normal[some])
+            self._add_distant(result, points, some, near, lambda cubes, far: ambient_cube.evaluate(cubes, normal[far]))
+        return result
+
+    def mean_irradiance(self, points: Float64) -> Float32:
+        """(n, 3) [lx]: the mean of the six faces at points (n, 3) [m] in the air."""
+        result = np.zeros((len(points), 3), np.float32)
+        for volume, some, near in self._parts(points):
+            share = evaluation_weights(basis_of_size(len(volume.values)), FACE_DIRECTIONS).mean(axis=0).astype(np.float32)
+            mean = np.tensordot(share, volume.values, axes=1)[None]
+            result[some] = near[:, None] * sample_coefficients(mean, volume.origin, volume.voxel_size, points[some])[:, 0]
+            self._add_distant(result, points, some, near, lambda cubes, _: cubes.mean(axis=1))
+        return result
+
+    def _parts(self, points: Float64) -> Iterator[tuple[Volume, Int64, Float32]]:
+        """Volumes, the points (k,) that each lights, and how much of their light (k,) is the volume's."""
+        room = rooms_of(points, self.rooms)
+        for number in np.unique(room).tolist():
+            there = np.flatnonzero(room == number)
+            if self.player is None:
+                centres, which = plan_volumes(points[there])
+            else:
+                centres, which = self.player[None], np.zeros(len(there), np.int64)
+            for i, centre in enumerate(centres):
+                members = there[which == i]
+                volume = self.volume_at(centre, number)
+                fades = self.distant is not None and number == ROOM_OUTDOORS
+                for start in range(0, len(members), SAMPLES_AT_ONCE):
+                    some = members[start : start + SAMPLES_AT_ONCE]
+                    yield volume, some, near_share(volume.origin, points[some]) if fades else np.ones(len(some), np.float32)
+
+    def _add_distant(self, result: Float32, points: Float64, some: Int64, near: Float32, seen: Callable[[Float32, Int64], Float32]) -> None:
+        """Add what ``seen`` makes of distant cubes (k, 6, 3) to the results of points that are not all the volume's."""
+        beyond = np.flatnonzero(near < 1)
+        if len(beyond) and self.distant is not None:
+            far = some[beyond]
+            result[far] += (1 - near[beyond])[:, None] * seen(sample_distant(self.distant, points[far]), far)
+
+
+def near_share(origin: Float64, points: Float64) -> Float32:
+    """How much of the light of points (n, 3) [m] is their volume's: 1 between its voxel centres, of which the first is at ``origin``
+    (3,) [m], 0 from FADE_M beyond them. (n,)"""
+    beyond = np.linalg.norm(points - np.clip(points, origin, origin + EXTENT_M), axis=1)
+    return np.asarray(np.clip(1 - beyond / FADE_M, 0, 1), np.float32)
+
+
+def sample_distant(distant: Distant, points: Float64) -> Float32:
+    """Cubes (n, 6, 3) [lx] of the distant texture at points (n, 3) [m]: bilinear between the centres of sectors that there are.
+
+    0 where none of the four is: no sector within 64 m.
+    """
+    rows, columns = distant.valid.shape
+    at = points[:, [0, 2]] / SECTOR_SIZE_M - 0.5 - np.array(distant.origin)
+    at = np.clip(at, 0, [columns - 1, rows - 1])
+    first = np.floor(at).astype(np.int64)
+    share = (at - first).astype(np.float32)
+    total, weights = np.zeros((len(points), 6, 3), np.float32), np.zeros(len(points), np.float32)
+    for right in (0, 1):
+        for down in (0, 1):
+            column, row = np.minimum(first[:, 0] + right, columns - 1), np.minimum(first[:, 1] + down, rows - 1)
+            weight = (share[:, 0] if right else 1 - share[:, 0]) * (share[:, 1] if down else 1 - share[:, 1])
+            weight = weight * distant.valid[row, column]
+            total += weight[:, None, None] * distant.values[row, column]
+            weights += weight
+    return np.asarray(total / np.maximum(weights, np.float32(1e-6))[:, None, None], np.float32)
+
+
+def plan_volumes(points: Float64) -> tuple[Float64, Int64]:
+    """Centres (v, 3) [m] of the volumes that cover points (n, 3) [m], and which one each point reads (n,).
+
+    A fixed lattice of overlapping volumes; when more than MAX_VOLUMES would be needed those with the fewest points are left out, and
+    their points read the nearest of the others.
+    """
+    tile = np.floor(points / TILE_M).astype(np.int64)
+    first = tile.min(axis=0)
+    shape = tuple(tile.max(axis=0) - first + 1)
+    # One number per tile: sorting rows would take longer than everything else that a picture needs.
+    keys, tile_of, counts = np.unique(np.ravel_multi_index(tuple((tile - first).T), shape), return_inverse=True, return_counts=True)
+    centres = (np.stack(np.unravel_index(keys, shape), axis=1) + first + 0.5) * TILE_M
+    kept = np.sort(np.argsort(-counts, kind="stable")[:MAX_VOLUMES])
+    distance = np.linalg.norm(centres[:, None] - centres[None, kept], axis=2)
+    return centres[kept], np.argmin(distance, axis=1)[tile_of]
