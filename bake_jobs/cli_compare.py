@@ -42,7 +42,8 @@ def run(
 ) -> None:
     """Measure, print the table on stdout, write what was asked for, and keep the report in the dataset where ``store`` says so.
 
-    Raises as ``compare_dataset``, ``load_lamps`` and ``load_scene`` do, and NonsenseError where receivers have no light by day.
+    Raises as ``compare_dataset``, ``load_lamps`` and ``load_scene`` do, and NonsenseError where receivers have no light by day, or none
+    that is a number.
     """
     if plot_path is not None and plot_path.suffix.lower() != ".png":
         raise InputError(f"--plot {plot_path}: expected a name that ends in .png")
@@ -92,7 +93,8 @@ def run(
         write_atomic(plot_path, picture.getvalue())
     if report["dark_by_day"]:
         shown = "; ".join(report["dark_by_day"][:5])
-        raise NonsenseError(f"{dataset_path}: this dataset is nonsense: receivers without any light by day in {shown}; bake it again")
+        said = "receivers without any light by day, or with light that is no number, in"
+        raise NonsenseError(f"{dataset_path}: this dataset is nonsense: {said} {shown}; bake it again")
     if store and lamps is None:
         _store(dataset_path, report, has_source=source is not None)
 

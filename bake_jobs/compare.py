@@ -183,7 +183,7 @@ def compare_dataset(
             _compare_surfaces(on_surfaces, served, points, reference, truth)
             if world.has_fine_voxels:
                 stages["shaded_fine"].add(_fine_light(engine, lighting, points), truth)
-            if is_day(lighting) and any(stages[stage].lacks_light() for stage in STAGES[:-1]):
+            if any(stages[stage].lacks_light(is_day(lighting)) for stage in STAGES[:-1]):
                 dark.append(f"{index.x},{index.z} {state}")
             if progress is not None:
                 progress(number * len(lightings) + place + 1, len(chosen) * len(lightings), f"sector {index.x},{index.z} {state}")
@@ -202,7 +202,7 @@ def compare_dataset(
         "seed": seed,
         # A client gets filled light where the mask says solid; the judge's voxels there count all the same.
         "open_air_called_solid": air["called_solid"] / max(air["open"], 1),
-        # Sectors and states with a value of exactly zero, or none at all, where the reference is lit by day.
+        # Sectors and states with a value of exactly zero where the reference is lit by day, or one that is no number.
         "dark_by_day": dark,
         "floor_fill": "voxels outside open air are filled from the nearest voxel in it, as the server does",
     }

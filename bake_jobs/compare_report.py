@@ -51,13 +51,13 @@ class StageSamples:
         # One path carries all channels, so their errors move together and add.
         self.standard_error.append(_luminance(reference.standard_error))
 
-    def lacks_light(self) -> bool:
-        """Whether what was added last has a value of exactly zero, or one that is no number, where the reference has light."""
-        if not self.served or not len(self.served[-1]):
+    def lacks_light(self, by_day: bool) -> bool:
+        """Whether what was added last has a value that is no number or, by day, one of exactly zero where the reference has light."""
+        if not self.served or not self.served[-1].size:
             return False
         served, reference = self.served[-1], self.reference[-1]
         lit = reference > DARKEST_SHARE_OF_MEAN * reference.mean()
-        return bool(((served == 0) | ~np.isfinite(served))[lit].any())
+        return not np.isfinite(served).all() or (by_day and bool((served == 0)[lit].any()))
 
     @property
     def count(self) -> int:
@@ -69,12 +69,12 @@ _RESAMPLES = 400
 
 
 def summarise(samples: StageSamples) -> dict[str, Any]:
-    """``n`` and FIGURES of one stage; all but n are None where there is nothing, or no light, to compare."""
+    """``n`` and FIGURES of one stage; all but n are None where there is nothing, or no light, to compare, or no number."""
     if samples.count == 0:
         return {"n": 0} | dict.fromkeys(FIGURES)
     served, reference, error = (np.concatenate(v) for v in (samples.served, samples.reference, samples.standard_error))
     mean = float(reference.mean())
-    if not mean > 0:
+    if not mean > 0 or not np.isfinite(served).all():
         return {"n": served.size} | dict.fromkeys(FIGURES)
     relative = _relative(served, reference)
     return {

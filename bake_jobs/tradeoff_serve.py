@@ -29,6 +29,8 @@ from gi_core.resident_sector import ResidentSector
 from gi_core.spectrum import LUMINANCE_FROM_RGB
 from gi_core.volume import sample_volume
 
+# Seeds that compare gives to probes, near and mid first: with the same paths after them, figures are those of its rows.
+DRAWN_BEFORE_SURFACES = 3
 PASSES = (1, 2, 3, 4, 6, 8)
 # Light (B, ..., 3) [lx] -> the bytes of a reply, and the light that a client reads of them.
 Encoding = Callable[[Float32], tuple[int, Float32]]
@@ -93,6 +95,7 @@ def served(
         points = points_of(tracer, dataset, index, sweep.points, sweep.seed)
         for place, lighting in enumerate(lightings):
             rng, lamps = sector_rng(sweep.seed, index, lighting.digest), lamps_on(engine.lamps, lighting)
+            rng.integers(1 << 62, size=DRAWN_BEFORE_SURFACES)
             truth = Reference(tracer, lighting, lamps, sweep.samples, rng, own, known).surfaces(points.surface, points.normal)
             for basis in served_from(own):
                 volume = engine.volume(points.eye, lighting, basis=basis)

@@ -1,6 +1,7 @@
 """``compare`` end to end on a dataset whose light can be written down: an open plain under a uniform sky, served by a stand-in engine
 that is right, or wrong by a known factor."""
 
+import json
 from types import SimpleNamespace
 
 import numpy as np
@@ -147,6 +148,22 @@ def test_wrong_light_shows_everywhere_but_in_the_floor(run):
 def test_black_light_is_wholly_wrong(run):
     stages = run(plain_engine(0.0))["states"]["noon"]
     assert all(stages[stage]["bias"] == -1 for stage in STAGES[:-1])
+
+
+def test_no_light_by_day_is_told_of_and_little_light_or_none_by_night_is_not(run, monkeypatch):
+    assert run(plain_engine(0.0), samples=64)["dark_by_day"] == []  # the stand-in's sky gives level ground no light
+    monkeypatch.setattr(compare, "is_day", lambda lighting: True)
+    assert run(plain_engine(0.0), samples=64)["dark_by_day"] == ["0,0 noon"]
+    assert run(plain_engine(1e-6), samples=64)["dark_by_day"] == []
+
+
+@pytest.mark.parametrize("factor", [np.nan, np.inf])
+def test_light_that_is_no_number_is_told_of_at_any_hour(run, factor):
+    report = run(plain_engine(factor), samples=64)
+    assert report["dark_by_day"] == ["0,0 noon"]
+    assert [report["states"]["noon"][stage]["median"] for stage in STAGES[:-1]] == [None] * 4
+    assert report["states"]["noon"]["floor"]["median"] < 0.2
+    json.dumps(report, allow_nan=False)
 
 
 def test_voxels_are_read_at_their_own_height(run):

@@ -87,7 +87,7 @@ def test_a_dataset_that_is_dark_by_day_fails(sectorlight: RunCommand, city: Path
     write_world(copy, replace(dataset.world, sectors=sectors))
     done = sectorlight("compare", str(copy), *SMALL, "--states", "noon,night", "--source", SOURCE)
     assert done.returncode == 1
-    assert "this dataset is nonsense: receivers without any light by day in" in done.stderr
+    assert "this dataset is nonsense: receivers without any light by day, or with light that is no number, in" in done.stderr
     assert "night" not in done.stderr
     assert Dataset.open(copy).world.error_report is None
 
