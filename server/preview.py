@@ -24,6 +24,7 @@ from gi_core.snow import snow_attribute, whitened
 from gi_core.world import Lamp
 from server.camera import Camera
 from server.preview_air import background, plain_distance, through_fog
+from server.preview_fog import add_fog_light
 from server.preview_lamps import draw_lamps, lamp_irradiance
 from server.preview_light import Beyond, ServedLight
 from server.preview_scene import PreviewScene
@@ -80,6 +81,7 @@ def render(
     radiance[hit] = through_fog(radiance[hit], surface.distance[hit], lighting)
     plain = plain_distance(camera.eye, directions[missed], float(scene.rays.low[1]))
     radiance[missed] = through_fog(radiance[missed], plain, lighting)
+    add_fog_light(radiance, camera, scene.rays, served, lighting, surface.distance)
     picture = radiance.reshape(shape)
     draw_lamps(picture, camera, scene.rays, lamps, surface.distance, lighting.fog_density)
     return picture

@@ -4,7 +4,7 @@ Fog takes light away by its extinction and gives back the sky's mean radiance, a
 
     L(d) = L(0) exp(-k d) + L_sky (1 - exp(-k d))
 
-Left out: that a street's fog sees less sky than a plain's, its glow around the sun, and what lamps give it.
+That holds in the open. What a street does to it is ``preview_fog``'s. Left out: its glow around the sun, and what lamps give it.
 """
 
 import numpy as np
@@ -31,10 +31,15 @@ def background(lighting: Lighting, directions: Float32) -> Float32:
     texel = [[sky[row0 + i, (column0 + j) % columns] for j in (0, 1)] for i in (0, 1)]
     top, bottom = (line[0] * (1 - right) + line[1] * right for line in texel)
     radiance = top * (1 - down) + bottom * down
-    open_ground = lighting.sky_cube[2] + sum(light.irradiance * max(light.direction[1], 0.0) for light in lighting.directional_lights)
-    albedo = whitened(np.full((1, 3), OUTSIDE_ALBEDO, np.float32), np.array([lighting.snow], np.float32))[0]
-    radiance[directions[:, 1] < 0] = albedo / np.pi * open_ground
+    radiance[directions[:, 1] < 0] = open_ground_radiance(lighting)
     return np.asarray(radiance, np.float32)
+
+
+def open_ground_radiance(lighting: Lighting) -> Float64:
+    """(3,) [cd m^-2]: of the open plain."""
+    irradiance = lighting.sky_cube[2] + sum(light.irradiance * max(light.direction[1], 0.0) for light in lighting.directional_lights)
+    albedo = whitened(np.full((1, 3), OUTSIDE_ALBEDO, np.float32), np.array([lighting.snow], np.float32))[0]
+    return np.asarray(albedo / np.pi * irradiance, np.float64)
 
 
 def plain_distance(eye: Float64, directions: Float32, ground: float) -> Float64:

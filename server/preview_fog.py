@@ -1,0 +1,132 @@
+"""Fog in a picture, marched through the light: shafts where the sun comes through, dusk in streets that see little sky.
+
+``preview_air.through_fog`` is right in the open, where fog is lit alike everywhere. Here its light is put right for what stands around:
+
+    added = integral over the way of k exp(-k s) (J(s) - J_open) ds          k: fog_density [m^-1], s: distance from the eye [m]
+
+    J / J_open = (A + sum of V_i p_i E_i) / (A_open + sum of p_i E_i),       J_open: the sky's mean radiance
+        A    the served volume's mean over directions / pi                   A_open: that of an open plain
+        V_i  1 where a shadow ray reaches sun or moon, 0 elsewhere           p_i E_i: their irradiance times the aerosol's phase function
+
+So in an open plain nothing is added, whatever the number of steps. The way ends at the surface, or where it leaves the box of the loaded
+geometry. It is marched for one ray per block of pixels, at STEPS places that are spread by transmittance and shifted from block to block in
+a fixed pattern; a pixel takes the mean of blocks around it that end at about its own distance.
+
+Left out: what lamps give fog directly, and that fog dims the sun's rays on their last metres (``Lighting`` has them dimmed already).
+"""
+
+import numpy as np
+
+from gi_core.arrays import Float32, Float64, Int64
+from gi_core.lighting import Lighting
+from gi_core.phase import aerosol_phase
+from server.camera import Camera
+from server.preview_air import mean_sky, open_ground_radiance
+from server.preview_light import ServedLight
+from server.raycast import RayCaster
+
+Taps = list[tuple[Int64, Float64]]
+
+# Edge of a block [pixels]: shafts are soft, and rays for each pixel would cost sixteen times as much.
+BLOCK = 4
+STEPS = 8
+# A pixel takes the mean of this many blocks by this many: a whole period of PATTERN, whose shifts then cancel.
+PERIOD = 4
+# Shifts of neighbouring blocks' steps: a 4 x 4 ordered dither (Bayer 1973).
+PATTERN = np.array([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]])
+# Blocks that end this much nearer or farther [share] count little for a pixel.
+DEPTH_TOLERANCE = 0.1
+# Of what is farther than this, in units of 1 / k, fog lets 2 % through.
+FARTHEST = 4.0
+
+
+def add_fog_light(radiance: Float32, camera: Camera, rays: RayCaster, served: ServedLight, lighting: Lighting, distance: Float64) -> None:
+    """Add to radiance (height * width, 3) [cd m^-2], in place, what the light around does to fog.
+
+    distance : (height * width,) [m] to each pixel's surface, inf for the sky
+    """
+    if lighting.fog_density == 0:
+        return
+    shape = (camera.height, camera.width)
+    middles = [np.minimum(np.arange(0, size, BLOCK) + BLOCK // 2, size - 1) for size in shape]
+    directions = camera.rays()
+    ends = np.minimum(way_end(rays, camera.eye, directions, distance), FARTHEST / lighting.fog_density)
+    chosen = (middles[0][:, None] * camera.width + middles[1]).ravel()
+    shift = (PATTERN[np.ix_(np.arange(len(middles[0])) % 4, np.arange(len(middles[1])) % 4)].ravel() + 0.5) / PATTERN.size
+    found = marched(camera.eye, directions[chosen], ends[chosen], shift, rays, served, lighting)
+    blocks = (len(middles[0]), len(middles[1]))
+    spread = spread_blocks(found.reshape(*blocks, 3), ends[chosen].reshape(blocks), ends.reshape(shape))
+    np.maximum(radiance + spread.reshape(-1, 3), 0, out=radiance)
+
+
+def way_end(rays: RayCaster, eye: Float64, directions: Float32, distance: Float64) -> Float64:
+    """How far air is looked at along rays (n, 3) from an eye (3,) [m]: (n,) [m].
+
+    To the surface at distances (n,) [m], or to where the box of all triangles is left; 0 along rays that miss it.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        sides = [(bound - eye) / directions.astype(np.float64) for bound in (rays.low, rays.high)]
+    # Along a ray within a side's own plane 0 / 0 is no bound.
+    entry, leave = np.nanmax(np.minimum(*sides), axis=1), np.nanmin(np.maximum(*sides), axis=1)
+    return np.minimum(distance, np.where(leave > np.maximum(entry, 0), leave, 0))
+
+
+def marched(
+    eye: Float64, directions: Float32, ends: Float64, shift: Float64, rays: RayCaster, served: ServedLight, lighting: Lighting
+) -> Float32:
+    """What is added along rays (n, 3) up to ``ends`` (n,) [m], their steps shifted by 0..1 (n,) of a step: (n, 3) [cd m^-2]."""
+    density = lighting.fog_density
+    lost = -np.expm1(-density * ends)
+    share = (np.arange(STEPS) + shift[:, None]) / STEPS
+    places = -np.log1p(-share * lost[:, None]) / density
+    points = (eye + places[..., None] * directions[:, None]).reshape(-1, 3)
+    light = served.mean_irradiance(points).reshape(len(ends), STEPS, 3).mean(axis=1) / np.pi
+    in_the_open = open_mean_radiance(lighting)[None].repeat(len(ends), axis=0)
+    for source in lighting.directional_lights:
+        arrives = rays.lit(points, source.direction.astype(np.float32)[None].repeat(len(points), axis=0), source.direction)
+        scattered = aerosol_phase(directions @ source.direction)[:, None] * source.irradiance
+        light += arrives.reshape(len(ends), STEPS).mean(axis=1)[:, None] * scattered
+        in_the_open += scattered
+    ratio = light / np.maximum(in_the_open, 1e-30)
+    return np.asarray(lost[:, None] * mean_sky(lighting) * (ratio - 1), np.float32)
+
+
+def open_mean_radiance(lighting: Lighting) -> Float64:
+    """(3,) [cd m^-2]: the mean over all directions in an open plain, as a volume's six faces have it: their mean / pi."""
+    # A uniform ground of radiance L gives pi L on the face that looks down, half of it on the four sides.
+    return np.asarray(lighting.sky_cube.mean(axis=0) / np.pi + open_ground_radiance(lighting) / 2, np.float64)
+
+
+def spread_blocks(found: Float32, depth: Float64, pixel_depth: Float64) -> Float32:
+    """Blocks (r, c, 3) whose rays end at ``depth`` (r, c) [m] -> pixels (height, width, 3) that end at theirs (height, width) [m].
+
+    First each block takes the mean of a period of the pattern around it, then each pixel one of the four blocks around it; both count by
+    how alike the depths are.
+    """
+    # Half of either end, so that every shift of the pattern counts alike.
+    taps = [(step, 0.5 if abs(step) == PERIOD // 2 else 1.0) for step in range(-PERIOD // 2, PERIOD // 2 + 1)]
+    down, across = ([(np.arange(size) + step, np.full(size, weight)) for step, weight in taps] for size in depth.shape)
+    smooth = _mean_of_alike(found, depth, depth, down, across)
+    return _mean_of_alike(smooth, depth, pixel_depth, _bilinear(pixel_depth.shape[0]), _bilinear(pixel_depth.shape[1]))
+
+
+def _bilinear(size: int) -> Taps:
+    """Along one axis, the two blocks around each pixel and their weights."""
+    at = (np.arange(size) - BLOCK // 2) / BLOCK
+    first = np.floor(at).astype(np.int64)
+    return [(first, 1 - (at - first)), (first + 1, at - first)]
+
+
+def _mean_of_alike(found: Float32, depth: Float64, depth_here: Float64, down: Taps, across: Taps) -> Float32:
+    """Weighted means of blocks (r, c, 3): (height, width, 3). A tap: for each row, or column, a block's and what it counts."""
+    total, weights = np.zeros((*depth_here.shape, 3), np.float32), np.zeros(depth_here.shape, np.float32)
+    log_here, log_depth = (np.log(np.maximum(d, 1e-3)).astype(np.float32) for d in (depth_here, depth))
+    for row, row_weight in down:
+        for column, column_weight in across:
+            block = np.ix_(np.clip(row, 0, len(depth) - 1), np.clip(column, 0, depth.shape[1] - 1))
+            # The last term: where no block is alike, all are.
+            alike = np.exp(np.abs(log_depth[block] - log_here) * np.float32(-1 / DEPTH_TOLERANCE)) + np.float32(1e-4)
+            weight = np.multiply.outer(row_weight, column_weight).astype(np.float32) * alike
+            total += weight[..., None] * found[block]
+            weights += weight
+    return np.asarray(total / weights[..., None], np.float32)
