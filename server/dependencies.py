@@ -139,6 +139,7 @@ class PreviewQuery(LightingQuery):
         "on", description="off: direct light only; split: left off, right on; error: against a path tracer, in false colour"
     )
     distant: Beyond = Field("on", description="beyond the volumes: the distant texture, or off; client: beyond the eye's one volume")
+    ao: Literal["on", "off"] = Field("off", description="on: what stands within 3 m dims indirect light")
 
     @model_validator(mode="after")
     def _has_direction(self) -> "PreviewQuery":

@@ -27,6 +27,7 @@ from server.preview_air import background, plain_distance, through_fog
 from server.preview_fog import add_fog_light
 from server.preview_lamps import draw_lamps, lamp_irradiance
 from server.preview_light import Beyond, ServedLight
+from server.preview_occlusion import kept_share
 from server.preview_scene import PreviewScene
 from server.raycast import RayCaster
 
@@ -46,6 +47,7 @@ class Look:
 
     indirect: Indirect = "on"
     distant: Beyond = "on"
+    occlusion: bool = False
 
 
 PLAIN_LOOK = Look()
@@ -75,7 +77,7 @@ def render(
     position, normal, triangle = surface.position[hit], surface.normal[hit], surface.triangle[hit]
     irradiance = direct_irradiance(scene.rays, lighting, lamps, position, normal)
     wanted = indirect_pixels(hit, camera.width, look.indirect)
-    irradiance[wanted] += served.irradiance(position[wanted], normal[wanted])
+    irradiance[wanted] += indirect_irradiance(scene.rays, served, look, position[wanted], normal[wanted])
     albedo = seen_albedo(scene, lighting, position, normal, triangle)
     radiance[hit] = albedo / np.pi * irradiance + scene.emission[triangle]
     radiance[hit] = through_fog(radiance[hit], surface.distance[hit], lighting)
@@ -110,3 +112,9 @@ def indirect_pixels(pixel: Int64, width: int, indirect: Indirect) -> Int64:
     if indirect == "split":
         return np.flatnonzero(pixel % width >= width // 2)
     return np.arange(len(pixel) if indirect == "on" else 0)
+
+
+def indirect_irradiance(rays: RayCaster, served: ServedLight, look: Look, position: Float64, normal: Float32) -> Float64:
+    """Indirect light (n, 3) [lx] on surface points (n, 3) [m] with normals (n, 3), as this look has it."""
+    light = served.irradiance(position, normal).astype(np.float64)
+    return light * kept_share(rays, position, normal)[:, None] if look.occlusion else light

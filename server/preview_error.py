@@ -17,6 +17,7 @@ from gi_core.lights import lamps_on
 from gi_core.settings import NEUTRAL
 from gi_core.spectrum import LUMINANCE_FROM_RGB
 from server.camera import Camera
+from server.preview import Look, indirect_irradiance
 from server.preview_light import ServedLight
 from server.preview_scene import PreviewScenes
 from server.service import Service
@@ -31,7 +32,7 @@ TOO_DARK, RIGHT, TOO_BRIGHT, NO_SURFACE = (33, 82, 176), (245, 245, 245), (178, 
 LEGEND_HEIGHT = 28
 
 
-def error_picture(service: Service, camera: Camera, lighting: Lighting) -> UInt8:
+def error_picture(service: Service, camera: Camera, lighting: Lighting, look: Look) -> UInt8:
     """sRGB (height, width, 3) of a camera's view, a legend at its foot. Raises CorruptFileError."""
     coarse = _coarse(camera)
     scene = service.preview_scenes.around(camera.eye, camera.look)
@@ -41,8 +42,8 @@ def error_picture(service: Service, camera: Camera, lighting: Lighting) -> UInt8
         hit = np.flatnonzero(surface.hit)
         if len(hit):
             position, normal = surface.position[hit], surface.normal[hit]
-            light = ServedLight.of(service.engine, lighting, NEUTRAL, "on", camera.eye)
-            served = light.irradiance(position, normal) @ LUMINANCE_FROM_RGB
+            light = ServedLight.of(service.engine, lighting, NEUTRAL, look.distant, camera.eye)
+            served = indirect_irradiance(scene.rays, light, look, position, normal) @ LUMINANCE_FROM_RGB
             error[hit] = relative_error(served, _traced(service, camera, lighting, position, normal))
     picture = Image.fromarray(false_colour(error.reshape(coarse.height, coarse.width)))
     return _with_legend(picture.resize((camera.width, camera.height), Image.Resampling.NEAREST), error)

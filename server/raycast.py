@@ -82,6 +82,12 @@ class RayCaster:
         length = np.sqrt(np.einsum("ij,ij->i", way[facing], way[facing]))
         return self._reach(facing, surface_position, surface_normal, way[facing], 1 - SHADOW_END_M / np.maximum(length, SHADOW_END_M))
 
+    def free_share(self, surface_position: Float64, surface_normal: Float32, way: Float32) -> Float32:
+        """How much of ways (n, 3) [m] from points (n, 3) [m] with normals (n, 3) is free of surfaces. -> (n,), 1 where nothing is met"""
+        origins = np.ascontiguousarray(surface_position + SHADOW_OFFSET_M * surface_normal - self.anchor, np.float32)
+        found = self._scene.run(origins, np.ascontiguousarray(way), dists=np.ones(len(way), np.float32), query="DISTANCE")
+        return np.minimum(np.asarray(found, np.float32), np.float32(1))
+
     def sees_from(self, eye: Float64, target: Float64) -> bool:
         """Whether nothing stands between two places (3,) [m] in the air."""
         way = (target - eye).astype(np.float32)
