@@ -17,6 +17,7 @@ from gi_core.errors import InputError
 from gi_core.json_fields import LARGEST_INTEGER
 from server.encoding import ArrayFormat, RawEncoding, VolumeFormat
 from server.preview_light import Beyond
+from server.preview_views import ViewName
 from server.service import Service
 
 # Beyond this float32 metres are coarser than a voxel's position needs, and no world reaches it.
@@ -140,11 +141,18 @@ class PreviewQuery(LightingQuery):
     )
     distant: Beyond = Field("on", description="beyond the volumes: the distant texture, or off; client: beyond the eye's one volume")
     ao: Literal["on", "off"] = Field("off", description="on: what stands within 3 m dims indirect light")
+    view: Literal["lit"] | ViewName = Field("lit", description="what lies behind the picture, in false colours or as spheres")
 
     @model_validator(mode="after")
     def _has_direction(self) -> "PreviewQuery":
         if np.linalg.norm(parse_vector(self.look) - parse_vector(self.eye)) < 1e-3:
             raise ValueError("look to be at least 1 mm from eye")
+        return self
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> "PreviewQuery":
+        if self.gi == "error" and self.view != "lit":
+            raise ValueError("either gi=error or another view than lit, not both")
         return self
 
 

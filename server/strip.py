@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image
 from rich.console import Console
 from rich.progress import track
 
@@ -22,6 +22,7 @@ from gi_core.weather import weather_presets
 from server import tonemap
 from server.camera import Camera
 from server.dependencies import parse_vector
+from server.labels import PAPER_GRAY, labelled
 from server.preview import city_radiance
 from server.preview_scene import PreviewScenes
 
@@ -30,10 +31,8 @@ KINDS: tuple[Kind, ...] = get_args(Kind)
 COLUMNS: dict[Kind, int] = {"day": 6, "weather": 4, "settings": 4}
 # Each pixel is the mean of this many by this many, so that windows and kerbs do not flicker from picture to picture.
 SAMPLES = 2
-LABEL_PIXELS = 15
 # Closer than this a direction is noise.
 MIN_VIEW_M = 1e-3
-LABEL_GRAY, PAPER_GRAY = 225, 20
 
 
 @dataclass(frozen=True)
@@ -102,15 +101,6 @@ def reduced(radiance: Float32, height: int) -> Float32:
     """The mean of each SAMPLES x SAMPLES pixels of (rows, columns, 3): (height, columns / SAMPLES, 3). Rows beyond are left out."""
     rows = radiance[: height * SAMPLES]
     return np.asarray(rows.reshape(height, SAMPLES, -1, SAMPLES, 3).mean(axis=(1, 3)), np.float32)
-
-
-def labelled(picture: UInt8, text: str) -> UInt8:
-    """A picture (rows, columns, 3) above a line of text."""
-    rows, columns = picture.shape[:2]
-    image = Image.new("RGB", (columns, rows + LABEL_PIXELS), (PAPER_GRAY,) * 3)
-    image.paste(Image.fromarray(picture), (0, 0))
-    ImageDraw.Draw(image).text((4, rows + 1), text, fill=(LABEL_GRAY,) * 3, font=ImageFont.load_default())
-    return np.asarray(image)
 
 
 def png(picture: UInt8) -> bytes:

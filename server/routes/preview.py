@@ -5,7 +5,7 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Request, Response
 
 from gi_core.lighting import Lighting
-from server import tonemap
+from server import preview_views, tonemap
 from server.caching import Body, conditional, strong_etag
 from server.camera import Camera
 from server.dependencies import PreviewQuery, ServiceDep, parse_vector
@@ -28,6 +28,10 @@ def preview(request: Request, service: ServiceDep, query: Annotated[PreviewQuery
 
     `ao=on` dims indirect light by what stands within 3 m, which a volume's voxels cannot see. Against the path tracer it mends corners;
     where the volumes are too dark already, as under an overcast sky, it makes them darker.
+
+    `view`, instead of the light: `albedo`, `normal`, `snow` (how much would stay), `sun` (what it reaches), `sectors`, `voxels` (the class
+    of the one in front of each surface); `probes` within 60 m of the eye as spheres that show their light, or the colours of their
+    `rooms`.
     """
     light = service.lighting(query.time, query.weather)
     etag = strong_etag("preview", REPLY_VERSION, service.light_identity, light.digest, query.model_dump(exclude={"time", "weather"}))
@@ -39,6 +43,9 @@ def picture(service: Service, query: PreviewQuery, light: Lighting) -> bytes:
     camera = Camera(parse_vector(query.eye), parse_vector(query.look), query.fov, query.width)
     look = Look("on" if query.gi == "error" else query.gi, query.distant, query.ao == "on")
     with service.preview_turn():
+        if query.view != "lit":
+            scene = service.preview_scenes.around(camera.eye, camera.look)
+            return tonemap.png_file(preview_views.draw(query.view, service.engine, scene, camera, light))
         if query.gi == "error":
             return tonemap.png_file(error_picture(service, camera, light, look))
         scene = service.preview_scenes.around(camera.eye, camera.look)

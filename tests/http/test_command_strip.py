@@ -13,7 +13,7 @@ from gi_core.engine import Engine
 from gi_core.settings import NEUTRAL, Settings
 from gi_core.settings_table import EXAMPLES, NIGHT, settings_table
 from gi_core.weather import weather_presets
-from server import strip
+from server import labels, strip
 
 STREET = np.array([48.0, 4.0, 3.0])
 
@@ -48,8 +48,8 @@ def test_pixels_are_means_of_samples():
 
 def test_a_label_lies_below_its_picture():
     picture = np.full((9, 60, 3), 7, np.uint8)
-    found = strip.labelled(picture, "13:00")
-    assert found.shape == (9 + strip.LABEL_PIXELS, 60, 3)
+    found = labels.labelled(picture, "13:00")
+    assert found.shape == (9 + labels.LABEL_PIXELS, 60, 3)
     np.testing.assert_array_equal(found[:9], picture)
     assert found[9:].max() > 150
 
@@ -63,7 +63,7 @@ def test_a_strip_is_a_sheet_and_the_same_again(sectorlight, city: Path, tmp_path
         sheets.append((tmp_path / name).read_bytes())
     assert sheets[0] == sheets[1]
     picture = np.asarray(Image.open(io.BytesIO(sheets[0])))
-    cell = 32 * 9 // 16 + strip.LABEL_PIXELS
+    cell = 32 * 9 // 16 + labels.LABEL_PIXELS
     assert picture.shape == (2 * cell, 4 * 32, 3)
     clear, snow = picture[:18, :32].astype(float), picture[cell : cell + 18, 64:96].astype(float)
     assert np.abs(clear - snow).mean() > 5  # seven different weathers, not one seven times
