@@ -8,9 +8,9 @@
         A    the served volume's mean over directions / pi                   A_open: that of an open plain
         V_i  1 where a shadow ray reaches sun or moon, 0 elsewhere           p_i E_i: their irradiance times the aerosol's phase function
 
-So in an open plain nothing is added, whatever the number of steps. The way ends at the surface, or where it leaves the box of the loaded
-geometry. It is marched for one ray per block of pixels, at STEPS places that are spread by transmittance and shifted from block to block in
-a fixed pattern; a pixel takes the mean of blocks around it that end at about its own distance.
+So in an open plain nothing is added, whatever the number of steps, nor outside the box of the loaded geometry: the way is the part of the
+ray inside, up to the surface. It is marched for one ray per block of pixels, at STEPS places that are spread by transmittance and shifted
+from block to block in a fixed pattern; a pixel takes the mean of blocks around it that end at about its own distance.
 
 Left out: what lamps give fog directly, and that fog dims the sun's rays on their last metres (``Lighting`` has them dimmed already).
 """
@@ -50,35 +50,45 @@ def add_fog_light(radiance: Float32, camera: Camera, rays: RayCaster, served: Se
     shape = (camera.height, camera.width)
     middles = [np.minimum(np.arange(0, size, BLOCK) + BLOCK // 2, size - 1) for size in shape]
     directions = camera.rays()
-    ends = np.minimum(way_end(rays, camera.eye, directions, distance), FARTHEST / lighting.fog_density)
+    starts, ends = way(rays, camera.eye, directions, np.minimum(distance, FARTHEST / lighting.fog_density))
     chosen = (middles[0][:, None] * camera.width + middles[1]).ravel()
     shift = (PATTERN[np.ix_(np.arange(len(middles[0])) % 4, np.arange(len(middles[1])) % 4)].ravel() + 0.5) / PATTERN.size
-    found = marched(camera.eye, directions[chosen], ends[chosen], shift, rays, served, lighting)
+    found = marched(camera.eye, directions[chosen], starts[chosen], ends[chosen], shift, rays, served, lighting)
     blocks = (len(middles[0]), len(middles[1]))
     spread = spread_blocks(found.reshape(*blocks, 3), ends[chosen].reshape(blocks), ends.reshape(shape))
     np.maximum(radiance + spread.reshape(-1, 3), 0, out=radiance)
 
 
-def way_end(rays: RayCaster, eye: Float64, directions: Float32, distance: Float64) -> Float64:
-    """How far air is looked at along rays (n, 3) from an eye (3,) [m]: (n,) [m].
+def way(rays: RayCaster, eye: Float64, directions: Float32, distance: Float64) -> tuple[Float64, Float64]:
+    """From where to where rays (n, 3) from an eye (3,) [m] are in the box of all triangles, at most ``distance`` (n,) [m] far.
 
-    To the surface at distances (n,) [m], or to where the box of all triangles is left; 0 along rays that miss it.
+    Two of (n,) [m]; the same where a ray misses the box.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         sides = [(bound - eye) / directions.astype(np.float64) for bound in (rays.low, rays.high)]
     # Along a ray within a side's own plane 0 / 0 is no bound.
-    entry, leave = np.nanmax(np.minimum(*sides), axis=1), np.nanmin(np.maximum(*sides), axis=1)
-    return np.minimum(distance, np.where(leave > np.maximum(entry, 0), leave, 0))
+    enter, leave = np.nanmax(np.minimum(*sides), axis=1), np.nanmin(np.maximum(*sides), axis=1)
+    start = np.clip(enter, 0, distance)
+    return start, np.maximum(start, np.minimum(leave, distance))
 
 
 def marched(
-    eye: Float64, directions: Float32, ends: Float64, shift: Float64, rays: RayCaster, served: ServedLight, lighting: Lighting
+    eye: Float64,
+    directions: Float32,
+    starts: Float64,
+    ends: Float64,
+    shift: Float64,
+    rays: RayCaster,
+    served: ServedLight,
+    lighting: Lighting,
 ) -> Float32:
-    """What is added along rays (n, 3) up to ``ends`` (n,) [m], their steps shifted by 0..1 (n,) of a step: (n, 3) [cd m^-2]."""
+    """What is added along rays (n, 3) between ``starts`` and ``ends`` (n,) [m], their steps shifted by 0..1 (n,) of a step: (n, 3)
+    [cd m^-2]."""
     density = lighting.fog_density
-    lost = -np.expm1(-density * ends)
+    first = np.exp(-density * starts)
+    lost = -first * np.expm1(-density * (ends - starts))
     share = (np.arange(STEPS) + shift[:, None]) / STEPS
-    places = -np.log1p(-share * lost[:, None]) / density
+    places = starts[:, None] - np.log1p(-share * (lost / first)[:, None]) / density
     points = (eye + places[..., None] * directions[:, None]).reshape(-1, 3)
     light = served.mean_irradiance(points).reshape(len(ends), STEPS, 3).mean(axis=1) / np.pi
     in_the_open = open_mean_radiance(lighting)[None].repeat(len(ends), axis=0)

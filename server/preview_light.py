@@ -40,6 +40,8 @@ EXTENT_M = (np.array([VOLUME_SHAPE[2], VOLUME_SHAPE[0], VOLUME_SHAPE[1]]) - 1) *
 MAX_VOLUMES = 128
 # Sampling holds some 300 bytes a point: 20 MB.
 SAMPLES_AT_ONCE = 1 << 16
+# Looking for the nearest of 128 volumes holds 3 kB a tile: 12 MB.
+TILES_AT_ONCE = 1 << 12
 # A quarter of a volume's width: no line shows where the texture, which is flat over tens of metres, takes over.
 FADE_M = 25.0
 
@@ -161,5 +163,8 @@ def plan_volumes(points: Float64) -> tuple[Float64, Int64]:
     keys, tile_of, counts = np.unique(np.ravel_multi_index(tuple((tile - first).T), shape), return_inverse=True, return_counts=True)
     centres = (np.stack(np.unravel_index(keys, shape), axis=1) + first + 0.5) * TILE_M
     kept = np.sort(np.argsort(-counts, kind="stable")[:MAX_VOLUMES])
-    distance = np.linalg.norm(centres[:, None] - centres[None, kept], axis=2)
-    return centres[kept], np.argmin(distance, axis=1)[tile_of]
+    nearest = np.empty(len(centres), np.int64)
+    for start in range(0, len(centres), TILES_AT_ONCE):
+        some = slice(start, start + TILES_AT_ONCE)
+        nearest[some] = np.argmin(np.linalg.norm(centres[some, None] - centres[None, kept], axis=2), axis=1)
+    return centres[kept], nearest[tile_of]

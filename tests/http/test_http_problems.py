@@ -1,12 +1,14 @@
 """Bad input is refused by name, as problem+json, and never as our failure."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, get_args
 
 import httpx
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+
+from server.preview_views import ViewName
 
 ProblemOf = Callable[[httpx.Response], dict[str, Any]]
 GOOD = {"time": "12:00", "weather": "clear", "x": "0", "y": "5", "z": "0"}
@@ -147,9 +149,17 @@ EYES = st.tuples(*[st.floats(-1e7, 1e7) | st.floats(-300, 300)] * 3).map(lambda 
 
 
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True)
-@given(eye=EYES, look=EYES, fov=st.floats(1, 150), gi=st.sampled_from(["on", "off", "split"]))
-def test_no_camera_is_our_failure(http: httpx.Client, eye: str, look: str, fov: float, gi: str) -> None:
-    query: dict[str, Any] = {"time": "12:00", "weather": "clear", "eye": eye, "look": look, "fov": fov, "gi": gi, "width": 16}
+@given(
+    eye=EYES,
+    look=EYES,
+    fov=st.floats(1, 150),
+    options=st.fixed_dictionaries({"gi": st.sampled_from(["on", "off", "split"]), "distant": st.sampled_from(["on", "off", "client"])})
+    | st.fixed_dictionaries({"view": st.sampled_from(get_args(ViewName))}),
+    fog=st.sampled_from(["0", "1e-9", "0.03", "0.2"]),
+)
+def test_no_camera_is_our_failure(http: httpx.Client, eye: str, look: str, fov: float, options: dict[str, str], fog: str) -> None:
+    query: dict[str, Any] = {"time": "12:00", "weather": f"clear:fog_density={fog}", "eye": eye, "look": look, "fov": fov, "width": 16}
+    query |= options
     assert http.get("/v1/preview.png", params=query).status_code < 500
 
 

@@ -12,7 +12,7 @@ from gi_core.phase import aerosol_phase
 from server.camera import Camera
 from server.preview import render
 from server.preview_air import mean_sky
-from server.preview_fog import BLOCK, PATTERN, add_fog_light, marched, open_mean_radiance, spread_blocks, way_end
+from server.preview_fog import BLOCK, PATTERN, add_fog_light, marched, open_mean_radiance, spread_blocks, way
 from server.preview_light import ServedLight
 from server.preview_scene import PreviewScene
 from server.raycast import RayCaster
@@ -71,13 +71,15 @@ def test_in_an_open_plain_nothing_is_added(monkeypatch: pytest.MonkeyPatch) -> N
 @pytest.mark.parametrize("share", [0.0, 0.3, 2.0])
 def test_without_a_sun_fog_follows_the_volume(share: float) -> None:
     lighting = sunny(lux=0.0)
-    found = marched(np.array([0.0, 10, 0]), one_ray([1, 0, 0]), np.array([60.0]), np.array([0.5]), PLAIN, served(lighting, share), lighting)
+    found = marched(
+        np.array([0.0, 10, 0]), one_ray([1, 0, 0]), np.zeros(1), np.array([60.0]), np.array([0.5]), PLAIN, served(lighting, share), lighting
+    )
     np.testing.assert_allclose(found[0], mean_sky(lighting) * (1 - np.exp(-FOG * 60)) * (share - 1), rtol=1e-5)
 
 
 def test_a_roof_takes_the_sun_s_share() -> None:
     lighting, towards = sunny(), one_ray([-1, 0, 0])
-    found = marched(np.array([-10.0, 10, 0]), towards, np.array([80.0]), np.array([0.5]), ROOFED, served(lighting), lighting)
+    found = marched(np.array([-10.0, 10, 0]), towards, np.zeros(1), np.array([80.0]), np.array([0.5]), ROOFED, served(lighting), lighting)
     sun = 3e4 * float(aerosol_phase(np.zeros(1))[0])  # the sun stands at right angles to the ray
     lost = sun / (sun + open_mean_radiance(lighting)[0])
     assert lost > 0.1
@@ -89,19 +91,31 @@ def test_a_shadow_s_edge_is_where_the_roof_ends() -> None:
     shifts = (np.arange(16) + 0.5) / 16
     rays = np.repeat(one_ray([-1, 0, 0]), 16, axis=0)
     # 40 m of sun, then 60 m of shadow.
-    found = marched(np.array([40.0, 10, 0]), rays, np.full(16, 100.0), shifts, ROOFED, served(lighting), lighting).mean(axis=0)
+    found = marched(np.array([40.0, 10, 0]), rays, np.zeros(16), np.full(16, 100.0), shifts, ROOFED, served(lighting), lighting).mean(
+        axis=0
+    )
     sun = 3e4 * float(aerosol_phase(np.zeros(1))[0])
     shadow = np.exp(-FOG * 40) - np.exp(-FOG * 100)
     # One part in 128 steps.
     np.testing.assert_allclose(found, -mean_sky(lighting) * shadow * sun / (sun + open_mean_radiance(lighting)[0]), rtol=0.02)
 
 
-def test_the_way_ends_at_a_surface_or_at_the_box() -> None:
+def test_the_way_is_what_lies_in_the_box_before_a_surface() -> None:
     rays = np.array([[1, 0, 0], [0, 1, 0], [0.6, 0.8, 0], [0, -1, 0]], np.float32)
-    inside = way_end(PLAIN, np.array([0.0, 20, 0]), rays, np.array([50.0, np.inf, np.inf, 20.0]))
-    np.testing.assert_allclose(inside, [50, 80, 100, 20], rtol=1e-6)
-    above = way_end(PLAIN, np.array([0.0, 120, 0]), rays, np.full(4, np.inf))
-    np.testing.assert_allclose(above, [0, 0, 0, 120], rtol=1e-6)
+    start, end = way(PLAIN, np.array([0.0, 20, 0]), rays, np.array([50.0, np.inf, np.inf, 20.0]))
+    np.testing.assert_allclose(start, 0)
+    np.testing.assert_allclose(end, [50, 80, 100, 20], rtol=1e-6)
+    start, end = way(PLAIN, np.array([0.0, 120, 0]), rays, np.array([1e6, 1e6, 1e6, 110.0]))
+    np.testing.assert_allclose(end - start, [0, 0, 0, 90], rtol=1e-6)
+    assert start[3] == pytest.approx(20)
+
+
+def test_fog_before_the_box_dims_what_is_added_in_it() -> None:
+    lighting, down = sunny(lux=0.0), one_ray([0, -1, 0])
+    found = marched(
+        np.array([0.0, 150, 0]), down, np.array([50.0]), np.array([150.0]), np.full(1, 0.5), PLAIN, served(lighting, 0.5), lighting
+    )
+    np.testing.assert_allclose(found[0], -0.5 * mean_sky(lighting) * (np.exp(-FOG * 50) - np.exp(-FOG * 150)), rtol=1e-5)
 
 
 def test_blocks_of_one_value_stay_so_and_the_pattern_s_shifts_cancel() -> None:
