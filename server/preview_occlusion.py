@@ -15,20 +15,24 @@ from server.raycast import RayCaster
 
 # A voxel's edge: what is farther, probes and voxels have seen.
 REACH_M = 3.0
-RAYS = 16
+RAYS = 12
 NEAR_ALBEDO = 0.35  # a light facade's
 
 
 def kept_share(rays: RayCaster, position: Float64, normal: Float32) -> Float32:
     """How much of the indirect light at surface points (n, 3) [m] with normals (n, 3) nearby surfaces leave: (n,) 0..1."""
-    reached = np.zeros(len(position), np.float32)
-    for towards in sphere_lattice(RAYS):
-        # A point of the unit sphere that touches the surface: normalised, its density is the cosine.
-        way = normal + towards
-        way *= np.float32(REACH_M) / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), np.float32(1e-6))
-        reached += rays.free_share(position, normal, way)
-    share = reached / np.float32(RAYS)
+    share = rays.free_share(position, normal, (cosine_way(normal, towards) for towards in sphere_lattice(RAYS)))
     return np.asarray(share / (1 - np.float32(NEAR_ALBEDO) * (1 - share)), np.float32)
+
+
+def cosine_way(normal: Float32, towards: Float32) -> Float32:
+    """Ways (n, 3) [m] of REACH_M: to a point of the unit sphere, ``towards`` (3,), that touches each surface with its normal (n, 3).
+
+    For points that are uniform on the sphere their density is the cosine.
+    """
+    way = normal + towards
+    length = np.sqrt(np.einsum("ij,ij->i", way, way))
+    return np.asarray(way * (np.float32(REACH_M) / np.maximum(length, np.float32(1e-6)))[:, None], np.float32)
 
 
 def sphere_lattice(count: int) -> Float32:

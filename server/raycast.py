@@ -1,5 +1,6 @@
 """Embree for pictures: what a camera sees and what the sun reaches. Float32 around an anchor; float64 world metres outside."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -82,11 +83,15 @@ class RayCaster:
         length = np.sqrt(np.einsum("ij,ij->i", way[facing], way[facing]))
         return self._reach(facing, surface_position, surface_normal, way[facing], 1 - SHADOW_END_M / np.maximum(length, SHADOW_END_M))
 
-    def free_share(self, surface_position: Float64, surface_normal: Float32, way: Float32) -> Float32:
-        """How much of ways (n, 3) [m] from points (n, 3) [m] with normals (n, 3) is free of surfaces. -> (n,), 1 where nothing is met"""
+    def free_share(self, surface_position: Float64, surface_normal: Float32, ways: Iterable[Float32]) -> Float32:
+        """How much of their ways points (n, 3) [m] with normals (n, 3) get on the mean before they meet a surface. -> (n,) 0..1
+
+        ways : one or more (n, 3) [m]
+        """
         origins = np.ascontiguousarray(surface_position + SHADOW_OFFSET_M * surface_normal - self.anchor, np.float32)
-        found = self._scene.run(origins, np.ascontiguousarray(way), dists=np.ones(len(way), np.float32), query="DISTANCE")
-        return np.minimum(np.asarray(found, np.float32), np.float32(1))
+        whole = np.ones(len(origins), np.float32)
+        found = [np.minimum(self._scene.run(origins, way, dists=whole.copy(), query="DISTANCE"), whole) for way in ways]
+        return np.asarray(np.mean(found, axis=0), np.float32)
 
     def sees_from(self, eye: Float64, target: Float64) -> bool:
         """Whether nothing stands between two places (3,) [m] in the air."""

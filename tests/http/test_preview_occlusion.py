@@ -29,7 +29,7 @@ def test_it_falls_from_a_corner_to_nothing_within_reach(at: float) -> None:
     assert (np.diff(kept[:5]) > 0).all()
     np.testing.assert_allclose(kept[4:], 1, atol=1e-6)
     # Right in the corner the wall takes half of all rays, and gives some back.
-    assert kept[0] == pytest.approx(0.5 / (1 - NEAR_ALBEDO * 0.5), abs=0.07)  # 16 rays: one is 0.06
+    assert kept[0] == pytest.approx(0.5 / (1 - NEAR_ALBEDO * 0.5), abs=0.08)  # 12 rays: one is 0.08
 
 
 def test_a_surface_counts_by_how_near_it_is() -> None:
