@@ -9,8 +9,10 @@
         V_i  1 where a shadow ray reaches sun or moon, 0 elsewhere           p_i E_i: their irradiance times the aerosol's phase function
 
 So in an open plain nothing is added, whatever the number of steps, nor outside the box of the loaded geometry: the way is the part of the
-ray inside, up to the surface. It is marched for one ray per block of pixels, at STEPS places that are spread by transmittance and shifted
-from block to block in a fixed pattern; a pixel takes the mean of blocks around it that end at about its own distance.
+ray inside, up to the surface. Beyond the volumes, 64 at most, it fades to nothing: the distant texture knows streets, not air.
+
+It is marched for one ray per block of pixels, at STEPS places that are spread by transmittance and shifted from block to block in a fixed
+pattern; a pixel takes the mean of blocks around it that end at about its own distance.
 
 Left out: what lamps give fog directly, and that fog dims the sun's rays on their last metres (``Lighting`` has them dimmed already).
 """
@@ -90,15 +92,16 @@ def marched(
     share = (np.arange(STEPS) + shift[:, None]) / STEPS
     places = starts[:, None] - np.log1p(-share * (lost / first)[:, None]) / density
     points = (eye + places[..., None] * directions[:, None]).reshape(-1, 3)
-    light = served.mean_irradiance(points).reshape(len(ends), STEPS, 3).mean(axis=1) / np.pi
-    in_the_open = open_mean_radiance(lighting)[None].repeat(len(ends), axis=0)
+    mean, known = served.mean_irradiance(points)
+    light = mean.reshape(len(starts), STEPS, 3) / np.pi
+    in_the_open = open_mean_radiance(lighting)[None].repeat(len(starts), axis=0)
     for source in lighting.directional_lights:
         arrives = rays.lit(points, source.direction.astype(np.float32)[None].repeat(len(points), axis=0), source.direction)
         scattered = aerosol_phase(directions @ source.direction)[:, None] * source.irradiance
-        light += arrives.reshape(len(ends), STEPS).mean(axis=1)[:, None] * scattered
+        light += arrives.reshape(len(starts), STEPS, 1) * scattered[:, None]
         in_the_open += scattered
-    ratio = light / np.maximum(in_the_open, 1e-30)
-    return np.asarray(lost[:, None] * mean_sky(lighting) * (ratio - 1), np.float32)
+    change = (light / np.maximum(in_the_open, 1e-30)[:, None] - 1) * known.reshape(len(starts), STEPS, 1)
+    return np.asarray(lost[:, None] * mean_sky(lighting) * change.mean(axis=1), np.float32)
 
 
 def open_mean_radiance(lighting: Lighting) -> Float64:

@@ -15,9 +15,8 @@ from typing import Literal
 import numpy as np
 
 from gi_core import ambient_cube
-from gi_core.ambient_cube import FACE_DIRECTIONS
 from gi_core.arrays import Float32, Float64, Int64
-from gi_core.basis import basis_of_size, evaluation_weights
+from gi_core.basis import average
 from gi_core.constants import ROOM_OUTDOORS, SECTOR_SIZE_M, VOLUME_SHAPE, VOXEL_SIZE_M
 from gi_core.engine import Distant, Engine
 from gi_core.errors import InputError
@@ -38,6 +37,8 @@ TILE_M = (np.array([VOLUME_SHAPE[2], VOLUME_SHAPE[0], VOLUME_SHAPE[1]]) - 4) * V
 EXTENT_M = (np.array([VOLUME_SHAPE[2], VOLUME_SHAPE[0], VOLUME_SHAPE[1]]) - 1) * VOXEL_SIZE_M
 # The pixels that these do not cover are far away.
 MAX_VOLUMES = 128
+# Steps through the air crowd near the eye; more volumes would make a far view of a city light all of it.
+MAX_AIR_VOLUMES = 64
 # Sampling holds some 300 bytes a point: 20 MB.
 SAMPLES_AT_ONCE = 1 << 16
 # Looking for the nearest of 128 volumes holds 3 kB a tile: 12 MB.
@@ -82,44 +83,42 @@ class ServedLight:
         # sample_volume reads this far off the surface, which may be the next volume's.
         points = position + SAMPLE_OFFSET_M * normal
         result = np.zeros((len(points), 3), np.float32)
-        for volume, some, near in self._parts(points):
-            result[some] = near[:, None] * sample_volume(volume.values, volume.origin, volume.voxel_size, position[some], normal[some])
-            self._add_distant(result, points, some, near, lambda cubes, far: ambient_cube.evaluate(cubes, normal[far]))
+        for volume, some, is_room in self._parts(points, MAX_VOLUMES):
+            result[some] = sample_volume(volume.values, volume.origin, volume.voxel_size, position[some], normal[some])
+            if self.distant is None or is_room:
+                continue
+            near = near_share(volume.origin, points[some])
+            far = np.flatnonzero(near < 1)
+            beyond = ambient_cube.evaluate(sample_distant(self.distant, points[some[far]]), normal[some[far]])
+            result[some[far]] += (1 - near[far])[:, None] * (beyond - result[some[far]])
         return result
 
-    def mean_irradiance(self, points: Float64) -> Float32:
-        """(n, 3) [lx]: the mean of the six faces at points (n, 3) [m] in the air."""
-        result = np.zeros((len(points), 3), np.float32)
-        for volume, some, near in self._parts(points):
-            share = evaluation_weights(basis_of_size(len(volume.values)), FACE_DIRECTIONS).mean(axis=0).astype(np.float32)
-            mean = np.tensordot(share, volume.values, axes=1)[None]
-            result[some] = near[:, None] * sample_coefficients(mean, volume.origin, volume.voxel_size, points[some])[:, 0]
-            self._add_distant(result, points, some, near, lambda cubes, _: cubes.mean(axis=1))
-        return result
+    def mean_irradiance(self, points: Float64) -> tuple[Float32, Float32]:
+        """Of points (n, 3) [m] in the air: irradiance averaged over directions (n, 3) [lx], and how far volumes know it, ``near_share`` (n,).
 
-    def _parts(self, points: Float64) -> Iterator[tuple[Volume, Int64, Float32]]:
-        """Volumes, the points (k,) that each lights, and how much of their light (k,) is the volume's."""
+        Of the distant texture nothing is taken: it is of the streets, not of the air above them.
+        """
+        result, known = np.zeros((len(points), 3), np.float32), np.zeros(len(points), np.float32)
+        for volume, some, _ in self._parts(points, MAX_AIR_VOLUMES):
+            mean = average(volume.values)[None]
+            result[some] = sample_coefficients(mean, volume.origin, volume.voxel_size, points[some])[:, 0]
+            known[some] = near_share(volume.origin, points[some])
+        return result, known
+
+    def _parts(self, points: Float64, most: int) -> Iterator[tuple[Volume, Int64, bool]]:
+        """Volumes, at most ``most`` of each room and of the open air, the points (k,) that each lights, and whether it is a room's."""
         room = rooms_of(points, self.rooms)
         for number in np.unique(room).tolist():
             there = np.flatnonzero(room == number)
             if self.player is None:
-                centres, which = plan_volumes(points[there])
+                centres, which = plan_volumes(points[there], most)
             else:
                 centres, which = self.player[None], np.zeros(len(there), np.int64)
             for i, centre in enumerate(centres):
                 members = there[which == i]
                 volume = self.volume_at(centre, number)
-                fades = self.distant is not None and number == ROOM_OUTDOORS
                 for start in range(0, len(members), SAMPLES_AT_ONCE):
-                    some = members[start : start + SAMPLES_AT_ONCE]
-                    yield volume, some, near_share(volume.origin, points[some]) if fades else np.ones(len(some), np.float32)
-
-    def _add_distant(self, result: Float32, points: Float64, some: Int64, near: Float32, seen: Callable[[Float32, Int64], Float32]) -> None:
-        """Add what ``seen`` makes of distant cubes (k, 6, 3) to the results of points that are not all the volume's."""
-        beyond = np.flatnonzero(near < 1)
-        if len(beyond) and self.distant is not None:
-            far = some[beyond]
-            result[far] += (1 - near[beyond])[:, None] * seen(sample_distant(self.distant, points[far]), far)
+                    yield volume, members[start : start + SAMPLES_AT_ONCE], number != ROOM_OUTDOORS
 
 
 def near_share(origin: Float64, points: Float64) -> Float32:
@@ -150,10 +149,10 @@ def sample_distant(distant: Distant, points: Float64) -> Float32:
     return np.asarray(total / np.maximum(weights, np.float32(1e-6))[:, None, None], np.float32)
 
 
-def plan_volumes(points: Float64) -> tuple[Float64, Int64]:
+def plan_volumes(points: Float64, most: int = MAX_VOLUMES) -> tuple[Float64, Int64]:
     """Centres (v, 3) [m] of the volumes that cover points (n, 3) [m], and which one each point reads (n,).
 
-    A fixed lattice of overlapping volumes; when more than MAX_VOLUMES would be needed those with the fewest points are left out, and
+    A fixed lattice of overlapping volumes; when more than ``most`` would be needed those with the fewest points are left out, and
     their points read the nearest of the others.
     """
     tile = np.floor(points / TILE_M).astype(np.int64)
@@ -162,7 +161,7 @@ def plan_volumes(points: Float64) -> tuple[Float64, Int64]:
     # One number per tile: sorting rows would take longer than everything else that a picture needs.
     keys, tile_of, counts = np.unique(np.ravel_multi_index(tuple((tile - first).T), shape), return_inverse=True, return_counts=True)
     centres = (np.stack(np.unravel_index(keys, shape), axis=1) + first + 0.5) * TILE_M
-    kept = np.sort(np.argsort(-counts, kind="stable")[:MAX_VOLUMES])
+    kept = np.sort(np.argsort(-counts, kind="stable")[:most])
     nearest = np.empty(len(centres), np.int64)
     for start in range(0, len(centres), TILES_AT_ONCE):
         some = slice(start, start + TILES_AT_ONCE)

@@ -77,6 +77,15 @@ def test_without_a_sun_fog_follows_the_volume(share: float) -> None:
     np.testing.assert_allclose(found[0], mean_sky(lighting) * (1 - np.exp(-FOG * 60)) * (share - 1), rtol=1e-5)
 
 
+def test_where_no_volume_is_nothing_is_known_and_nothing_added() -> None:
+    lighting = sunny()
+    elsewhere = ServedLight(served(lighting, 0.3).volume_at, player=np.array([1000.0, 0, 0]))
+    found = marched(
+        np.array([-10.0, 10, 0]), one_ray([-1, 0, 0]), np.zeros(1), np.array([80.0]), np.full(1, 0.5), ROOFED, elsewhere, lighting
+    )
+    np.testing.assert_array_equal(found, 0)
+
+
 def test_a_roof_takes_the_sun_s_share() -> None:
     lighting, towards = sunny(), one_ray([-1, 0, 0])
     found = marched(np.array([-10.0, 10, 0]), towards, np.zeros(1), np.array([80.0]), np.array([0.5]), ROOFED, served(lighting), lighting)
