@@ -94,7 +94,7 @@ class ServedLight:
         return result
 
     def mean_irradiance(self, points: Float64) -> tuple[Float32, Float32]:
-        """Of points (n, 3) [m] in the air: irradiance averaged over directions (n, 3) [lx], and how far volumes know it, ``near_share`` (n,).
+        """Of points (n, 3) [m] in the air: the mean over directions (n, 3) [lx], and how far volumes know it, ``near_share`` (n,).
 
         Of the distant texture nothing is taken: it is of the streets, not of the air above them.
         """
