@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pyopencl as cl
 
-from gi_core.arrays import Bool, Float32, Float64, UInt8, UInt16
+from gi_core.arrays import Bool, Float32, Float64, Int64, UInt8, UInt16
 from gi_core.basis import convert, served_from
 from gi_core.coarse_volume import CoarseSums, KeptCoarse, covered_sectors
 from gi_core.constants import (
@@ -165,11 +165,7 @@ class Engine:
 
     def _volume(self, position: Float64, light: _Light, basis: str) -> Volume:
         first = volume_first_voxel(position)
-        boxes = [box for box in plan_boxes(first) if box.index in self.dataset.world.sectors]
-        if not boxes:
-            raise OutsideWorldError(self._outside(position))
-        values = np.zeros((BASIS_SIZES[basis], *VOLUME_SHAPE, 3), np.float32)
-        mask = np.full(VOLUME_SHAPE, VOXEL_NO_SECTOR, np.uint8)
+        boxes, values, mask = self._empty_volume(position, first, basis)
         with self._lock:
             target = self._device.allocate(values.nbytes)
             unlit = [box for box in boxes if not self._fill(box, light, target, mask, basis)]
@@ -179,6 +175,14 @@ class Engine:
             has_light[box_slices(box)[1:]] = False
         _fill_columns(values, has_light)
         return Volume(values, mask, first, tuple(box.index for box in boxes), basis, self._expected_error(basis))
+
+    def _empty_volume(self, position: Float64, first: Int64, basis: str) -> tuple[list[SectorBox], Float32, UInt8]:
+        """What a volume reads, at least one box, and its light and mask to be filled. Raises OutsideWorldError."""
+        boxes = [box for box in plan_boxes(first) if box.index in self.dataset.world.sectors]
+        if not boxes:
+            raise OutsideWorldError(self._outside(position))
+        values = np.zeros((BASIS_SIZES[basis], *VOLUME_SHAPE, 3), np.float32)
+        return boxes, values, np.full(VOLUME_SHAPE, VOXEL_NO_SECTOR, np.uint8)
 
     def _fine_volume(self, position: Float64, light: _Light, basis: str) -> Volume:
         world = self.dataset.world
@@ -243,11 +247,7 @@ class Engine:
         light, basis = self._light(lighting, settings), self._served(basis)
         self._expect_inside(position)
         first = volume_first_voxel(position)
-        boxes = [box for box in plan_boxes(first) if box.index in self.dataset.world.sectors]
-        if not boxes:
-            raise OutsideWorldError(self._outside(position))
-        values = np.zeros((BASIS_SIZES[basis], *VOLUME_SHAPE, 3), np.float32)
-        mask = np.full(VOLUME_SHAPE, VOXEL_NO_SECTOR, np.uint8)
+        boxes, values, mask = self._empty_volume(position, first, basis)
         lit_rooms = np.full(VOLUME_SHAPE, ROOM_OUTDOORS, np.uint16)
         reached: set[int] = set()
         with self._lock:
