@@ -28,6 +28,7 @@ from bake_jobs.scene_source import load_scene
 from gi_core.ambient_cube import basis_weights
 from gi_core.arrays import AnyArray, Float32, Float64
 from gi_core.basis import evaluate, evaluation_weights, projection_weights
+from gi_core.error_report import DARKEST_SHARE_OF_MEAN
 from gi_core.grid import SectorIndex
 from gi_core.lighting_model import make_lighting
 from gi_core.spectrum import LUMINANCE_FROM_RGB
@@ -35,7 +36,6 @@ from gi_core.spectrum import LUMINANCE_FROM_RGB
 POINTS_PER_SECTOR = 40
 NORMALS = 96
 SAMPLES = 4096
-DARKEST_SHARE_OF_MEAN = 0.02  # as in compare_report
 DIAGONALS = np.array([[x, y, z] for x in (1, -1) for y in (1, -1) for z in (1, -1)], np.float64) / np.sqrt(3)
 
 

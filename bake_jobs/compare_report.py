@@ -24,11 +24,8 @@ from rich.table import Table
 from bake_jobs.path_tracer import Estimate
 from gi_core.arrays import AnyArray, Float64
 from gi_core.container import write_atomic
-from gi_core.error_report import expected_error
+from gi_core.error_report import DARKEST_SHARE_OF_MEAN, expected_error
 from gi_core.spectrum import LUMINANCE_FROM_RGB
-
-# Below this share of the mean a point is black to the eye, and dividing by it would only measure noise.
-DARKEST_SHARE_OF_MEAN = 0.02
 
 BAR_COLOURS = ("#4878a8", "#d08a3c", "#5f9e5a", "#9a6fb0", "#b85a5a", "#6f8f98")
 CHART_SIZE = (900, 420)

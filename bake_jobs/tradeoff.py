@@ -123,7 +123,7 @@ def run(
         path = output / "rows" / f"{variant.folder}.json"
         row = None if restart else _finished(path, sweep, variant)
         if row is None:
-            row = _measure(sweep, variant, output / "datasets" / variant.folder, jobs, device, restart, known, say)
+            row = _measure(sweep, variant, output / "datasets" / variant.folder, jobs, device, known, say)
             write_atomic(path, (json.dumps(row, indent=1, sort_keys=True) + "\n").encode())
         rows.append(row)
     say(wanted[0], "ticks of all")
@@ -137,7 +137,6 @@ def _measure(
     folder: Path,
     jobs: int | None,
     device: str | None,
-    restart: bool,
     known: dict[bytes, list[Estimate]],
     say: Callable[[Variant, str], None],
 ) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from bake_jobs.compare import Reference, points_of, sector_rng
-from bake_jobs.compare_report import DARKEST_SHARE_OF_MEAN, StageSamples, summarise
+from bake_jobs.compare_report import StageSamples, summarise
 from bake_jobs.compare_states import parse_states
 from bake_jobs.path_tracer import Estimate, PathTracer
 from bake_jobs.tradeoff import Sweep, Variant, asked
@@ -20,6 +20,7 @@ from gi_core.container import write_atomic
 from gi_core.dataset import Dataset
 from gi_core.device import shared_device
 from gi_core.engine import Engine
+from gi_core.error_report import DARKEST_SHARE_OF_MEAN
 from gi_core.grid import SectorIndex
 from gi_core.lighting import Lighting
 from gi_core.lights import lamps_on

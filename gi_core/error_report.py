@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 
 FINE, CUBE, OWN = "shaded_fine", "shaded_cube", "shaded"
+# Below this share of the mean a point is black to the eye, and dividing by it would only measure noise.
+DARKEST_SHARE_OF_MEAN = 0.02
 
 
 def expected_error(report: Mapping[str, Any] | None, own_basis: str, basis: str, cascade: int = 0) -> float | None:

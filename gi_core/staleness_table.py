@@ -20,6 +20,7 @@ from gi_core.arrays import Float32, Float64
 from gi_core.clock_time import parse_time
 from gi_core.dataset import Dataset
 from gi_core.engine import Engine
+from gi_core.error_report import DARKEST_SHARE_OF_MEAN
 from gi_core.errors import InputError
 from gi_core.light_blend import LightVector
 from gi_core.light_track import LightTrack
@@ -43,7 +44,6 @@ RUN_TICKS = 150
 CHECKS = 10  # over the second half of the run
 FLICKER_HZ = 3.0
 LAMPS = 8
-DARKEST_SHARE_OF_MEAN = 0.02  # as `compare` has it
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from gi_core.arrays import Float32, Float64, UInt8
+from gi_core.error_report import DARKEST_SHARE_OF_MEAN
 from gi_core.lighting import Lighting
 from gi_core.lights import lamps_on
 from gi_core.settings import NEUTRAL
@@ -26,7 +27,6 @@ from server.service import Service
 MAX_POINTS = 8192
 SAMPLES = 256
 SEED = 0
-DARKEST_SHARE_OF_MEAN = 0.02  # as compare has it
 FULL_SCALE = 0.5  # where colours end: errors of 50 % and more
 TOO_DARK, RIGHT, TOO_BRIGHT, NO_SURFACE = (33, 82, 176), (245, 245, 245), (178, 34, 34), (70, 70, 70)
 LEGEND_HEIGHT = 28
