@@ -1,5 +1,6 @@
 """The relighter: passes over resident sectors, a few each tick or until nothing moves any more (slide "Relighting")."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,16 +43,26 @@ class Relighter:
         self.device = device
         self._light: LightOnDevice | None = None
 
-    def relight(self, residents: list[ResidentSector], given: RelightInput, passes: int = 1) -> None:
-        """Enqueue passes over sectors; each pass adds one bounce to the cubes that a sector holds. Returns before the device is done."""
+    def relight(self, residents: Sequence[ResidentSector], given: RelightInput, passes: int | Sequence[int] = 1) -> None:
+        """Enqueue passes over sectors, as many for each or a number of its own; each pass adds one bounce to the cubes that a sector holds.
+
+        One sector's are on their way when this returns. Several go on side by side, and all but the first's are done.
+        """
         if self._light is None or self._light.given is not given:
             self._light = LightOnDevice(self.device, given)
         for resident in residents:
             resident.light(self._light)
-        for _ in range(passes):
-            for resident in residents:
-                resident.enqueue_pass()
-        self.device.queue.flush()
+        lanes = self.device.lanes[: len(residents)]
+        if len(lanes) > 1:
+            # By the host: what queues wait for one another costs more than going on side by side gains.
+            self.device.queue.finish()
+        each = [passes] * len(residents) if isinstance(passes, int) else passes
+        for place, (resident, count) in enumerate(zip(residents, each, strict=True)):
+            resident.enqueue(lanes[place % len(lanes)], count)
+        for lane in lanes:
+            lane.flush()
+        for lane in lanes[1:]:
+            lane.finish()
 
     def converge(self, resident: ResidentSector, given: RelightInput, residual: float = QUERY_RESIDUAL) -> Converged:
         """Relight a sector from darkness until what later bounces could still add is below ``residual`` times the peak.

@@ -2,8 +2,9 @@
 
 What changes seldom is worked out when it changes, and a pass only does what every bounce needs:
 
-    light changed   sun_on_surfels, light_bricks: direct exitance of bricks
-    snow changed    collect_bounces: what bricks send on of their feedback probes' light
+    lamps changed   lamps_on_bricks: what bricks send out of lamps' light, and their own emission
+    sun changed     sun_on_surfels, light_bricks: direct exitance of bricks
+    snow changed    both of these, and collect_bounces: what bricks send on of their feedback probes' light
     every pass      bounce_bricks, gather_probes
 """
 
@@ -19,13 +20,11 @@ from gi_core import factor_weights, relight_twin
 from gi_core.arrays import AnyArray, Float32, UInt32
 from gi_core.basis import FEEDBACK, basis_of_size, conversion
 from gi_core.constants import BASIS_SIZES
-from gi_core.device import Device, SharedKernel
+from gi_core.device import BoundKernel, Device
 from gi_core.layout import BOUNCE
 from gi_core.relight_input import RelightInput
 from gi_core.rooms import outdoor_blend
 from gi_core.sector import Sector, starts
-
-Launch = Callable[..., None]
 
 VOXEL_GROUP = (8, 4, 1)  # work-items of fill_volume.cl along x, y, z; see SharedKernel
 # gather_probes.cl reads whole vectors, beyond the last factor's codes and the last probe's scales.
@@ -75,6 +74,7 @@ class ResidentSector:
         self.bounces: cl.Buffer | None = None
         self.bounce_starts: cl.Buffer | None = None
         self.sun_sample: cl.Buffer | None = None
+        self.lamps_on_bricks: cl.Buffer | None = None
         self._lamps: cl.Buffer | None = None
         self._sky_patches = sky_patches
         self._converted: tuple[str, cl.Buffer, cl.Buffer] | None = None
@@ -82,8 +82,10 @@ class ResidentSector:
         self._has_snow = bool(sector.surfel_snow.any())
         self._light: LightOnDevice | None = None
         self._direct_of: object = None
+        self._lamps_of: float | None = None
         self._bounces_of: float | None = None
-        self._launches: dict[str, tuple[tuple[object, ...], Launch]] = {}
+        self._due: list[tuple[BoundKernel, tuple[cl.Buffer, ...]]] = []
+        self._kernels: dict[str, tuple[tuple[object, ...], BoundKernel]] = {}
 
     @property
     def nbytes(self) -> int:
@@ -113,7 +115,9 @@ class ResidentSector:
         To be called again when the contents have changed.
         """
         if surfel_light is not None or self._lamps is not None:
-            self._lamps, self._direct_of = surfel_light, None
+            self._lamps, self._lamps_of, self._direct_of = surfel_light, None, None
+            if surfel_light is None:
+                self.lamps_on_bricks = None
 
     def set_sun_sample(self, sun_sample: cl.Buffer | None) -> None:
         """The surfels' samples of the sun's shadow map: uint8 on the device, padded to whole groups of
@@ -125,7 +129,10 @@ class ResidentSector:
             self.sun_sample, self._direct_of = sun_sample, None
 
     def light(self, light: LightOnDevice) -> None:
-        """Enqueue what the passes need to know of the light; nothing when it is as it was."""
+        """Get ready for passes under this light; nothing to do when it is as it was. ``enqueue`` follows.
+
+        What seldom changes is enqueued here, in the device's own queue.
+        """
         if self.sector.probe_count == 0:
             return
         if light is not self._light and len(light.given.patch_exitance) != self._sky_patches:
@@ -138,21 +145,24 @@ class ResidentSector:
             self._collect_bounces(snow)
             self._bounces_of = snow
         if self._direct_of != light.identity:
-            count, shining = len(light.given.lights), [] if light.lights is None else [light.lights]
-            if shining:
-                self._prepared("sun_on_surfels", (count, self.sun_sample), partial(self._sun_on_surfels, count))(*shining)
-            about = (count, snow, self._lamps, self.sun_share)
-            self._prepared("light_bricks", about, partial(self._light_bricks, count, snow))(*shining)
+            self._due = self._direct_light(light, snow)
             self._direct_of = light.identity
 
-    def enqueue_pass(self) -> None:
-        """Enqueue one pass: one more bounce on the cubes that the sector holds. ``light`` comes first."""
+    def enqueue(self, queue: cl.CommandQueue, passes: int) -> None:
+        """Enqueue passes, each one more bounce on the cubes that the sector holds. ``light`` comes first."""
         sector, light = self.sector, self._light
         if sector.probe_count == 0:
             return
         assert light is not None
-        self._prepared("bounce_bricks", (self.bounces,), self._bounce_bricks)(light.patches)
-        self._prepared("gather_probes", (), partial(self._gather_probes, self.cubes))()
+        for kernel, lights in self._due:
+            kernel.launch(queue, *lights)
+        self._due = []
+        if passes:
+            bounce = self._bound("bounce_bricks", (self.bounces,), self._bounce_bricks)
+            gather = self._bound("gather_probes", (), partial(self._gather_probes, self.cubes))
+        for _ in range(passes):
+            bounce.launch(queue, light.patches)
+            gather.launch(queue)
 
     def enqueue_first_bounce(self, cubes: cl.Buffer) -> None:
         """Enqueue what one pass from darkness gives, into other cubes than the sector's own: sky and the first surface alone."""
@@ -160,8 +170,8 @@ class ResidentSector:
             return
         assert self._light is not None
         no_bounces = self.device.allocate(4 * (self.sector.brick_count + 1))
-        self._bounce_bricks(no_bounces)(self._light.patches)
-        self._gather_probes(cubes)()
+        self._bounce_bricks(no_bounces).launch(self.device.queue, self._light.patches)
+        self._gather_probes(cubes).launch(self.device.queue)
 
     def converted(self, basis: str, cubes: cl.Buffer | None = None) -> cl.Buffer:
         """The sector's light, or other ``cubes`` of its probes, in a basis that is served: a buffer that the next call writes again.
@@ -209,61 +219,75 @@ class ResidentSector:
             padded[..., :3] = cubes
             cl.enqueue_copy(self.device.queue, self.cubes, padded)
 
-    def _launch(self, kernel: SharedKernel, items: int, *arguments: Any) -> Launch:
-        """A launch that lacks no argument, or only the last ones."""
-        return partial(kernel.launch_1d, items, *arguments)
+    def _bind(self, name: str, defines: dict[str, int], items: int, *arguments: Any) -> BoundKernel:
+        return BoundKernel(self.device, self.device.kernel(name, **defines), items, *arguments)
 
-    def _prepared(self, name: str, about: tuple[object, ...], make: Callable[[], Launch]) -> Launch:
-        """The launch that ``make`` made when this was last ``about`` the same: gathering arguments takes as long as a launch itself."""
-        known = self._launches.get(name)
+    def _bound(self, name: str, about: tuple[object, ...], make: Callable[[], BoundKernel]) -> BoundKernel:
+        """What ``make`` made when this was last ``about`` the same."""
+        known = self._kernels.get(name)
         if known is None or known[0] != about:
-            known = self._launches[name] = about, make()
+            known = self._kernels[name] = about, make()
         return known[1]
 
-    def _sun_on_surfels(self, count: int) -> Launch:
+    def _direct_light(self, light: LightOnDevice, snow: float) -> list[tuple[BoundKernel, tuple[cl.Buffer, ...]]]:
+        """Kernels to launch, with the arguments that they lack, so that bricks hold their direct exitance."""
+        count, lights = len(light.given.lights), () if light.lights is None else (light.lights,)
+        due: list[tuple[BoundKernel, tuple[cl.Buffer, ...]]] = []
+        if self._lamps is not None and self._lamps_of != snow:
+            self.lamps_on_bricks = self.lamps_on_bricks or self.device.allocate(self.sector.brick_count * 16)
+            due.append((self._bound("lamps_on_bricks", (snow, self._lamps, self.lamps_on_bricks), partial(self._light_by_lamps, snow)), ()))
+            self._lamps_of = snow
+        if lights:
+            due.append((self._bound("sun_on_surfels", (count, self.sun_sample), partial(self._sun_on_surfels, count)), lights))
+        about = (count, snow, self.lamps_on_bricks, self.sun_share)
+        due.append((self._bound("light_bricks", about, partial(self._light_bricks, count, snow)), lights))
+        return due
+
+    def _light_by_lamps(self, snow: float) -> BoundKernel:
+        defines = {"HAS_EMISSION": int(self.brick_emission is not None), "HAS_SNOW": int(snow > 0)}
+        arguments: list[Any] = [np.uint32(self.sector.brick_count), self.brick_starts, self.surfel_albedo, self._lamps]
+        arguments += [] if self.brick_emission is None else [self.brick_emission]
+        arguments.append(self.lamps_on_bricks)
+        arguments += [np.float32(snow)] if snow > 0 else []
+        return self._bind("lamps_on_bricks", defines, self.sector.brick_count, *arguments)
+
+    def _sun_on_surfels(self, count: int) -> BoundKernel:
         """Lacks the lights."""
         if self.sun_visibility is None:
             self.sun_visibility = self.device.upload(self.sector.sun_visibility)
         if self.sun_share is None or self.sun_share.size < count * self._groups * SURFELS_PER_GROUP * 4:
             self.sun_share = self.device.allocate(count * self._groups * SURFELS_PER_GROUP * 4)
-        kernel = self.device.shared_kernel("sun_on_surfels", DIRECTIONAL_LIGHTS=count, HAS_SUN_MAP=int(self.sun_sample is not None))
+        defines = {"DIRECTIONAL_LIGHTS": count, "HAS_SUN_MAP": int(self.sun_sample is not None)}
         sample = [] if self.sun_sample is None else [self.sun_sample]
         plane_bytes = np.uint32(4 * self.sector.sun_visibility.shape[1])
         surfels = (np.uint32(self._groups), self.surfel_normal, self.sun_visibility, plane_bytes)
-        return self._launch(kernel, self._groups, *surfels, *sample, self.sun_share)
+        return self._bind("sun_on_surfels", defines, self._groups, *surfels, *sample, self.sun_share)
 
-    def _light_bricks(self, count: int, snow: float) -> Launch:
+    def _light_bricks(self, count: int, snow: float) -> BoundKernel:
         """Lacks the lights, if there are any."""
-        kernel = self.device.shared_kernel(
-            "light_bricks",
-            DIRECTIONAL_LIGHTS=count,
-            HAS_EMISSION=int(self.brick_emission is not None),
-            HAS_SNOW=int(snow > 0),
-            HAS_LAMPS=int(self._lamps is not None),
-        )
-        arguments: list[Any] = [np.uint32(self.sector.brick_count), self.brick_starts, self.surfel_albedo]
-        arguments += [buffer for buffer in (self.brick_emission, self._lamps) if buffer is not None]
-        arguments.append(self.direct)
-        if snow > 0:
-            arguments.append(np.float32(snow))
+        glow = self.brick_emission if self.lamps_on_bricks is None else self.lamps_on_bricks
+        defines = {"DIRECTIONAL_LIGHTS": count, "HAS_GLOW": int(glow is not None), "HAS_SNOW": int(snow > 0 and count > 0)}
+        arguments: list[Any] = [np.uint32(self.sector.brick_count), self.direct]
+        arguments += [] if glow is None else [glow]
         if count:
-            arguments += [self.sun_share, np.uint32(self._groups * SURFELS_PER_GROUP)]
-        return self._launch(kernel, self.sector.brick_count, *arguments)
+            arguments += [self.brick_starts, self.surfel_albedo, self.sun_share, np.uint32(self._groups * SURFELS_PER_GROUP)]
+            arguments += [np.float32(snow)] if snow > 0 else []
+        return self._bind("light_bricks", defines, self.sector.brick_count, *arguments)
 
-    def _bounce_bricks(self, bounce_starts: cl.Buffer | None = None) -> Launch:
+    def _bounce_bricks(self, bounce_starts: cl.Buffer | None = None) -> BoundKernel:
         """Lacks the sky patches."""
         bricks, patches = self.sector.brick_count, self._sky_patches
         bounces = (bounce_starts or self.bounce_starts or self.direct, self.bounces or self.direct)
-        kernel = self.device.shared_kernel("bounce_bricks", BASIS_SIZE=self.sector.basis_size)
         counts = (np.uint32(bricks), np.uint32(patches))
         light = (self.direct, self.cubes, *([] if self.brick_basis is None else [self.brick_basis]))
-        return self._launch(kernel, bricks + patches, *counts, *bounces, *light, self.exitance)
+        defines = {"BASIS_SIZE": self.sector.basis_size}
+        return self._bind("bounce_bricks", defines, bricks + patches, *counts, *bounces, *light, self.exitance)
 
-    def _gather_probes(self, cubes: cl.Buffer) -> Launch:
+    def _gather_probes(self, cubes: cl.Buffer) -> BoundKernel:
         sector = self.sector
-        kernel = self.device.shared_kernel("gather_probes", BASIS_SIZE=sector.basis_size)
         factors = (self.factor_starts, self.sky_starts, self.factor_source, self.factor_code, self.factor_scale)
-        return self._launch(kernel, sector.probe_count, np.uint32(sector.probe_count), *factors, self.exitance, cubes)
+        arguments = (np.uint32(sector.probe_count), *factors, self.exitance, cubes)
+        return self._bind("gather_probes", {"BASIS_SIZE": sector.basis_size}, sector.probe_count, *arguments)
 
     def _collect_bounces(self, snow: float) -> None:
         """Bounces of the sector under this much snow. Which there are does not depend on the snow: the first time counts them."""
@@ -286,7 +310,7 @@ class ResidentSector:
             surfels = [self.surfel_normal, np.uint32(self._groups * SURFELS_PER_GROUP)] if self._is_cube else []
             bricks = np.uint32(sector.brick_count)
             read = (self.brick_starts, self.surfel_albedo, *surfels, probe, *weight)
-            self._launch(kernel, sector.brick_count, bricks, *read, bounce_starts, bounces, count, *last)()
+            kernel.launch_1d(sector.brick_count, bricks, *read, bounce_starts, bounces, count, *last)
 
         if self.bounce_starts is None:
             # A surfel reads one face of the cube for each axis.

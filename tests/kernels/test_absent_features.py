@@ -12,7 +12,7 @@ from gi_core.relight_input import RelightInput
 from gi_core.resident_sector import ResidentSector
 
 PATCHES = 6
-FEATURES = ("HAS_EMISSION", "HAS_SNOW", "HAS_LAMPS")
+FEATURES = ("HAS_GLOW", "HAS_SNOW")
 
 
 @pytest.fixture
@@ -51,7 +51,7 @@ def defines_of(device: Device, kernel: str) -> dict[str, int]:
 
 def test_a_sector_under_the_sky_alone_has_nothing_else(fresh, make_sector):
     resident = lit(fresh, plain(make_sector), light(0))
-    for absent in ("sun_visibility", "sun_share", "sun_sample", "brick_emission"):
+    for absent in ("sun_visibility", "sun_share", "sun_sample", "brick_emission", "lamps_on_bricks"):
         assert getattr(resident, absent) is None, absent
     assert {name for name, _ in fresh.built_kernels} == {"collect_bounces", "light_bricks", "bounce_bricks", "gather_probes"}
     assert defines_of(fresh, "light_bricks") == {"DIRECTIONAL_LIGHTS": 0} | dict.fromkeys(FEATURES, 0)
@@ -85,8 +85,9 @@ def test_lamps_and_samples_are_the_code_and_bytes_that_they_ask_for(fresh, make_
     sector = plain(make_sector)
     without = lit(fresh, sector, light(1))
     lamps = lit(fresh, sector, light(1), lamps=True)
-    assert lamps.nbytes - without.nbytes == 16 * sector.surfel_count
+    assert lamps.nbytes - without.nbytes == 16 * (sector.surfel_count + sector.brick_count)
     sampled = lit(fresh, sector, light(1), sample=True)
     assert sampled.nbytes - without.nbytes == -(-sector.surfel_count // 8) * 8
-    assert {defines["HAS_LAMPS"] for name, defines in fresh.built_kernels if name == "light_bricks"} == {0, 1}
+    assert {defines["HAS_GLOW"] for name, defines in fresh.built_kernels if name == "light_bricks"} == {0, 1}
+    assert defines_of(fresh, "lamps_on_bricks") == {"HAS_EMISSION": 0, "HAS_SNOW": 0}
     assert {defines["HAS_SUN_MAP"] for name, defines in fresh.built_kernels if name == "sun_on_surfels"} == {0, 1}
