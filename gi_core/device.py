@@ -15,8 +15,7 @@ from kernels_cl import include_directory, source
 
 ENVIRONMENT = "SECTORLIGHT_DEVICE"
 GROUP = 32  # work-items per work-group
-# In-order queues for work that does not depend on one another. PoCL goes to sleep and wakes up between two kernels of one queue.
-LANES = 2
+LANES = 2  # in-order queues for work that goes on side by side
 
 
 def available_devices() -> list[cl.Device]:
@@ -73,43 +72,22 @@ class SharedKernel:
         self._knows_types = False
         self._lock = threading.Lock()
 
-    def launch(self, size: tuple[int, ...], group: tuple[int, ...] | None, *arguments: Any) -> None:
-        """Enqueue the kernel: global and local size (None: the driver picks one), then buffers, NumPy scalars and (1,) records, each
-        of the same type at every launch."""
+    def launch(self, size: tuple[int, ...], group: tuple[int, ...] | None, *arguments: Any, queue: cl.CommandQueue | None = None) -> None:
+        """Enqueue the kernel: global and local size (None: the driver picks one), then buffers, None for those that the kernel does not
+        read, NumPy scalars and (1,) records, each of the same type at every launch. ``queue``: the device's own, or another lane."""
         with self._lock:
             if not self._knows_types:
-                self._kernel.set_scalar_arg_dtypes([None if isinstance(given, cl.Buffer) else given.dtype for given in arguments])
+                self._kernel.set_scalar_arg_dtypes(
+                    [None if given is None or isinstance(given, cl.Buffer) else given.dtype for given in arguments]
+                )
                 self._knows_types = True
-            event = self._kernel(self._device.queue, size, group, *arguments)
+            event = self._kernel(queue or self._device.queue, size, group, *arguments)
         if self._device.launched is not None:
             self._device.launched.append((self._kernel.function_name, event))
 
-    def launch_1d(self, items: int, *arguments: Any) -> None:
+    def launch_1d(self, items: int, *arguments: Any, queue: cl.CommandQueue | None = None) -> None:
         """Enqueue the kernel for some work-items, rounded up to whole work-groups of GROUP: kernels guard against the excess."""
-        self.launch((-(-items // GROUP) * GROUP,), (GROUP,), *arguments)
-
-
-class BoundKernel:
-    """A kernel that one owner launches again and again: its arguments stay set, all but the last ones, which saves most of a launch's time.
-
-    Making one takes 0.1 ms.
-    """
-
-    def __init__(self, device: "Device", kernel: cl.Kernel, items: int, *arguments: Any) -> None:
-        """For ``items`` work-items, rounded up to whole work-groups of GROUP; the kernel is the owner's."""
-        self._device, self._kernel = device, kernel
-        self._size, self._group = (-(-items // GROUP) * GROUP,), (GROUP,)
-        self._arguments = arguments  # OpenCL does not keep them alive
-        for place, given in enumerate(arguments):
-            kernel.set_arg(place, given)
-
-    def launch(self, queue: cl.CommandQueue, *last: cl.Buffer) -> None:
-        """Enqueue it with the arguments that it lacks. One thread at a time."""
-        for place, given in enumerate(last, len(self._arguments)):
-            self._kernel.set_arg(place, given)
-        event = cl.enqueue_nd_range_kernel(queue, self._kernel, self._size, self._group)
-        if self._device.launched is not None:
-            self._device.launched.append((self._kernel.function_name, event))
+        self.launch((-(-items // GROUP) * GROUP,), (GROUP,), *arguments, queue=queue)
 
 
 class Device:
@@ -122,6 +100,7 @@ class Device:
         """
         self.device = choose_device(name or os.environ.get(ENVIRONMENT))
         self.name = describe(self.device)
+        self.is_processor = bool(self.device.type & cl.device_type.CPU)
         self.context = cl.Context([self.device])
         properties = cl.command_queue_properties.PROFILING_ENABLE if timed else 0
         self.lanes = tuple(cl.CommandQueue(self.context, properties=properties) for _ in range(LANES))

@@ -141,10 +141,9 @@ class LiveSector:
         beyond = local - np.clip(local, self._low, self._high)
         return bool(beyond @ beyond < range_m * range_m)
 
-    def relight(self, relighter: Relighter, light: LiveLight, passes: int) -> None:
-        """Enqueue lamps and passes. ``measure`` must follow."""
+    def light(self, light: LiveLight) -> None:
+        """Have the relight that follows read the lamps of this light, if they can be had at once. ``measure`` must follow it."""
         self._lamps_late = not self.set_lamps(light, wait=False)
-        relighter.relight([self.resident], light.given, passes)
 
     def measure(self) -> float:
         """Read what a relight gave: how far it moved the probes' light, as a share of the brightest."""

@@ -223,10 +223,13 @@ class LiveWorld:
         chosen = [int(rows[k]) for k in plan_tick(tick, needs.relit_at[rows], changes, away, places=self._places)]
         change_of = dict(zip(rows.tolist(), changes.tolist(), strict=True))
         sectors = [residents[self.streamer.table.sectors[row]] for row in chosen]
+        passes = []
         for row, sector in zip(chosen, sectors, strict=True):
-            passes = 1 if change_of[row] <= BURST_CHANGE else BURST_PASSES if sector.is_lit else FIRST_PASSES
-            sector.relight(self._relighter, light, passes)
-            report.passes += passes
+            sector.light(light)
+            passes.append(1 if change_of[row] <= BURST_CHANGE else BURST_PASSES if sector.is_lit else FIRST_PASSES)
+        if sectors:
+            self._relighter.relight([sector.resident for sector in sectors], light.given, passes)
+        report.passes = sum(passes)
         for row, sector in zip(chosen, sectors, strict=True):
             needs.relit(row, tick, light.vector, sector.measure())
         report.relit = tuple(self.streamer.table.sectors[row] for row in chosen)

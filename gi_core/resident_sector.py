@@ -2,15 +2,15 @@
 
 What changes seldom is worked out when it changes, and a pass only does what every bounce needs:
 
+    snow changed    collect_bounces: what bricks send on of their feedback probes' light
     lamps changed   lamps_on_bricks: what bricks send out of lamps' light, and their own emission
     sun changed     sun_on_surfels, light_bricks: direct exitance of bricks
-    snow changed    both of these, and collect_bounces: what bricks send on of their feedback probes' light
     every pass      bounce_bricks, gather_probes
+
+On a processor the last two lines are one kernel, relight_sector.
 """
 
-from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from gi_core import factor_weights, relight_twin
 from gi_core.arrays import AnyArray, Float32, UInt32
 from gi_core.basis import FEEDBACK, basis_of_size, conversion
 from gi_core.constants import BASIS_SIZES
-from gi_core.device import BoundKernel, Device
+from gi_core.device import Device
 from gi_core.layout import BOUNCE
 from gi_core.relight_input import RelightInput
 from gi_core.rooms import outdoor_blend
@@ -84,8 +84,8 @@ class ResidentSector:
         self._direct_of: object = None
         self._lamps_of: float | None = None
         self._bounces_of: float | None = None
-        self._due: list[tuple[BoundKernel, tuple[cl.Buffer, ...]]] = []
-        self._kernels: dict[str, tuple[tuple[object, ...], BoundKernel]] = {}
+        self._no_bounces: cl.Buffer | None = None
+        self._is_lit_anew = True
 
     @property
     def nbytes(self) -> int:
@@ -144,34 +144,24 @@ class ResidentSector:
         if self._bounces_of != snow:
             self._collect_bounces(snow)
             self._bounces_of = snow
+        if self._lamps is not None and self._lamps_of != snow:
+            self._light_by_lamps(snow)
+            self._lamps_of = snow
         if self._direct_of != light.identity:
-            self._due = self._direct_light(light, snow)
-            self._direct_of = light.identity
+            if light.lights is not None:
+                self._make_room_for_sun(len(light.given.lights))
+            self._direct_of, self._is_lit_anew = light.identity, True
 
     def enqueue(self, queue: cl.CommandQueue, passes: int) -> None:
         """Enqueue passes, each one more bounce on the cubes that the sector holds. ``light`` comes first."""
-        sector, light = self.sector, self._light
-        if sector.probe_count == 0:
-            return
-        assert light is not None
-        for kernel, lights in self._due:
-            kernel.launch(queue, *lights)
-        self._due = []
-        if passes:
-            bounce = self._bound("bounce_bricks", (self.bounces,), self._bounce_bricks)
-            gather = self._bound("gather_probes", (), partial(self._gather_probes, self.cubes))
-        for _ in range(passes):
-            bounce.launch(queue, light.patches)
-            gather.launch(queue)
+        if self.sector.probe_count:
+            self._relight(queue, passes, self.bounce_starts, self.cubes)
 
     def enqueue_first_bounce(self, cubes: cl.Buffer) -> None:
         """Enqueue what one pass from darkness gives, into other cubes than the sector's own: sky and the first surface alone."""
-        if self.sector.probe_count == 0:
-            return
-        assert self._light is not None
-        no_bounces = self.device.allocate(4 * (self.sector.brick_count + 1))
-        self._bounce_bricks(no_bounces).launch(self.device.queue, self._light.patches)
-        self._gather_probes(cubes).launch(self.device.queue)
+        if self.sector.probe_count:
+            self._no_bounces = self._no_bounces or self.device.allocate(4 * (self.sector.brick_count + 1))
+            self._relight(self.device.queue, 1, self._no_bounces, cubes)
 
     def converted(self, basis: str, cubes: cl.Buffer | None = None) -> cl.Buffer:
         """The sector's light, or other ``cubes`` of its probes, in a basis that is served: a buffer that the next call writes again.
@@ -219,75 +209,59 @@ class ResidentSector:
             padded[..., :3] = cubes
             cl.enqueue_copy(self.device.queue, self.cubes, padded)
 
-    def _bind(self, name: str, defines: dict[str, int], items: int, *arguments: Any) -> BoundKernel:
-        return BoundKernel(self.device, self.device.kernel(name, **defines), items, *arguments)
+    def _relight(self, queue: cl.CommandQueue, passes: int, bounce_starts: cl.Buffer | None, cubes: cl.Buffer) -> None:
+        """Direct light if it is another than before, then passes over ``cubes``."""
+        sector, light = self.sector, self._light
+        assert light is not None
+        lights, snow = len(light.given.lights), light.given.snow if self._has_snow else 0.0
+        glow = self.brick_emission if self.lamps_on_bricks is None else self.lamps_on_bricks
+        groups, bricks, probes = np.uint32(self._groups), np.uint32(sector.brick_count), np.uint32(sector.probe_count)
+        plane_bytes = np.uint32(4 * sector.sun_visibility.shape[1])
+        sun_defines = {"DIRECTIONAL_LIGHTS": lights, "HAS_SUN_MAP": int(lights > 0 and self.sun_sample is not None)}
+        sun = (groups, self.surfel_normal, self.sun_visibility, plane_bytes, self.sun_sample, self.sun_share)
+        surfels = (glow, self.brick_starts, self.surfel_albedo)
+        brick_defines = {"DIRECTIONAL_LIGHTS": lights, "HAS_GLOW": int(glow is not None), "HAS_SNOW": int(lights > 0 and snow > 0)}
+        basis = {"BASIS_SIZE": sector.basis_size}
+        patches, bounces = np.uint32(self._sky_patches), (bounce_starts, self.bounces)
+        factors = (self.factor_starts, self.sky_starts, self.factor_source, self.factor_code, self.factor_scale)
+        run = self.device.shared_kernel
+        if self.device.is_processor:
+            run("relight_sector", **(sun_defines | brick_defines | basis)).launch(
+                (1,),
+                (1,),
+                *(np.uint32(self._is_lit_anew), np.uint32(passes)),
+                *sun,
+                *(bricks, self.direct, *surfels, np.float32(snow), light.lights),
+                *(patches, *bounces, self.brick_basis, self.exitance, light.patches),
+                *(probes, *factors, cubes),
+                queue=queue,
+            )
+        else:
+            if self._is_lit_anew and bricks:
+                if lights:
+                    run("sun_on_surfels", **sun_defines).launch_1d(self._groups, *sun, light.lights, queue=queue)
+                share = (self.sun_share, np.uint32(self._groups * SURFELS_PER_GROUP), np.float32(snow), light.lights)
+                run("light_bricks", **brick_defines).launch_1d(sector.brick_count, bricks, self.direct, *surfels, *share, queue=queue)
+            bounced = (*bounces, self.direct, cubes, self.brick_basis, self.exitance, light.patches)
+            for _ in range(passes):
+                items = sector.brick_count + self._sky_patches
+                run("bounce_bricks", **basis).launch_1d(items, bricks, patches, *bounced, queue=queue)
+                run("gather_probes", **basis).launch_1d(sector.probe_count, probes, *factors, self.exitance, cubes, queue=queue)
+        self._is_lit_anew = False
 
-    def _bound(self, name: str, about: tuple[object, ...], make: Callable[[], BoundKernel]) -> BoundKernel:
-        """What ``make`` made when this was last ``about`` the same."""
-        known = self._kernels.get(name)
-        if known is None or known[0] != about:
-            known = self._kernels[name] = about, make()
-        return known[1]
-
-    def _direct_light(self, light: LightOnDevice, snow: float) -> list[tuple[BoundKernel, tuple[cl.Buffer, ...]]]:
-        """Kernels to launch, with the arguments that they lack, so that bricks hold their direct exitance."""
-        count, lights = len(light.given.lights), () if light.lights is None else (light.lights,)
-        due: list[tuple[BoundKernel, tuple[cl.Buffer, ...]]] = []
-        if self._lamps is not None and self._lamps_of != snow:
-            self.lamps_on_bricks = self.lamps_on_bricks or self.device.allocate(self.sector.brick_count * 16)
-            due.append((self._bound("lamps_on_bricks", (snow, self._lamps, self.lamps_on_bricks), partial(self._light_by_lamps, snow)), ()))
-            self._lamps_of = snow
-        if lights:
-            due.append((self._bound("sun_on_surfels", (count, self.sun_sample), partial(self._sun_on_surfels, count)), lights))
-        about = (count, snow, self.lamps_on_bricks, self.sun_share)
-        due.append((self._bound("light_bricks", about, partial(self._light_bricks, count, snow)), lights))
-        return due
-
-    def _light_by_lamps(self, snow: float) -> BoundKernel:
-        defines = {"HAS_EMISSION": int(self.brick_emission is not None), "HAS_SNOW": int(snow > 0)}
-        arguments: list[Any] = [np.uint32(self.sector.brick_count), self.brick_starts, self.surfel_albedo, self._lamps]
-        arguments += [] if self.brick_emission is None else [self.brick_emission]
-        arguments.append(self.lamps_on_bricks)
-        arguments += [np.float32(snow)] if snow > 0 else []
-        return self._bind("lamps_on_bricks", defines, self.sector.brick_count, *arguments)
-
-    def _sun_on_surfels(self, count: int) -> BoundKernel:
-        """Lacks the lights."""
+    def _make_room_for_sun(self, lights: int) -> None:
         if self.sun_visibility is None:
             self.sun_visibility = self.device.upload(self.sector.sun_visibility)
-        if self.sun_share is None or self.sun_share.size < count * self._groups * SURFELS_PER_GROUP * 4:
-            self.sun_share = self.device.allocate(count * self._groups * SURFELS_PER_GROUP * 4)
-        defines = {"DIRECTIONAL_LIGHTS": count, "HAS_SUN_MAP": int(self.sun_sample is not None)}
-        sample = [] if self.sun_sample is None else [self.sun_sample]
-        plane_bytes = np.uint32(4 * self.sector.sun_visibility.shape[1])
-        surfels = (np.uint32(self._groups), self.surfel_normal, self.sun_visibility, plane_bytes)
-        return self._bind("sun_on_surfels", defines, self._groups, *surfels, *sample, self.sun_share)
+        nbytes = lights * self._groups * SURFELS_PER_GROUP * 4
+        if self.sun_share is None or self.sun_share.size < nbytes:
+            self.sun_share = self.device.allocate(nbytes)
 
-    def _light_bricks(self, count: int, snow: float) -> BoundKernel:
-        """Lacks the lights, if there are any."""
-        glow = self.brick_emission if self.lamps_on_bricks is None else self.lamps_on_bricks
-        defines = {"DIRECTIONAL_LIGHTS": count, "HAS_GLOW": int(glow is not None), "HAS_SNOW": int(snow > 0 and count > 0)}
-        arguments: list[Any] = [np.uint32(self.sector.brick_count), self.direct]
-        arguments += [] if glow is None else [glow]
-        if count:
-            arguments += [self.brick_starts, self.surfel_albedo, self.sun_share, np.uint32(self._groups * SURFELS_PER_GROUP)]
-            arguments += [np.float32(snow)] if snow > 0 else []
-        return self._bind("light_bricks", defines, self.sector.brick_count, *arguments)
-
-    def _bounce_bricks(self, bounce_starts: cl.Buffer | None = None) -> BoundKernel:
-        """Lacks the sky patches."""
-        bricks, patches = self.sector.brick_count, self._sky_patches
-        bounces = (bounce_starts or self.bounce_starts or self.direct, self.bounces or self.direct)
-        counts = (np.uint32(bricks), np.uint32(patches))
-        light = (self.direct, self.cubes, *([] if self.brick_basis is None else [self.brick_basis]))
-        defines = {"BASIS_SIZE": self.sector.basis_size}
-        return self._bind("bounce_bricks", defines, bricks + patches, *counts, *bounces, *light, self.exitance)
-
-    def _gather_probes(self, cubes: cl.Buffer) -> BoundKernel:
-        sector = self.sector
-        factors = (self.factor_starts, self.sky_starts, self.factor_source, self.factor_code, self.factor_scale)
-        arguments = (np.uint32(sector.probe_count), *factors, self.exitance, cubes)
-        return self._bind("gather_probes", {"BASIS_SIZE": sector.basis_size}, sector.probe_count, *arguments)
+    def _light_by_lamps(self, snow: float) -> None:
+        bricks = self.sector.brick_count
+        self.lamps_on_bricks = self.lamps_on_bricks or self.device.allocate(bricks * 16)
+        kernel = self.device.shared_kernel("lamps_on_bricks", HAS_EMISSION=int(self.brick_emission is not None), HAS_SNOW=int(snow > 0))
+        surfels = (self.brick_starts, self.surfel_albedo, self._lamps)
+        kernel.launch_1d(bricks, np.uint32(bricks), *surfels, self.brick_emission, np.float32(snow), self.lamps_on_bricks)
 
     def _collect_bounces(self, snow: float) -> None:
         """Bounces of the sector under this much snow. Which there are does not depend on the snow: the first time counts them."""

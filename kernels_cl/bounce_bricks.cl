@@ -17,25 +17,15 @@
 
 #include "layout.h"
 
-__kernel void bounce_bricks(
-    const uint bricks,
-    const uint patches,
+// Exitance of one brick. brick_basis is null for a cube.
+inline float4 bounce_brick(
+    const uint brick,
     __global const uint *bounce_starts,
     __global const Bounce *bounces,
     __global const float4 *direct,
     __global const float4 *probe_cube,
-#if BASIS_SIZE != 6
-    __global const float *brick_basis,
-#endif
-    __global float4 *exitance,
-    __global const float4 *patch_exitance)
+    __global const float *brick_basis)
 {
-    const uint brick = get_global_id(0);
-    if (brick >= bricks) {
-        if (brick < bricks + patches)
-            exitance[brick] = patch_exitance[brick - bricks];
-        return;
-    }
     float4 sum = direct[brick];
     const uint end = bounce_starts[brick + 1];
 #if BASIS_SIZE != 6
@@ -66,5 +56,23 @@ __kernel void bounce_bricks(
 #if BASIS_SIZE != 6
     sum = sum > 0.0f ? sum : 0.0f;
 #endif
-    exitance[brick] = sum;
+    return sum;
+}
+
+__kernel void bounce_bricks(
+    const uint bricks,
+    const uint patches,
+    __global const uint *bounce_starts,
+    __global const Bounce *bounces,
+    __global const float4 *direct,
+    __global const float4 *probe_cube,
+    __global const float *brick_basis,
+    __global float4 *exitance,
+    __global const float4 *patch_exitance)
+{
+    const uint brick = get_global_id(0);
+    if (brick < bricks)
+        exitance[brick] = bounce_brick(brick, bounce_starts, bounces, direct, probe_cube, brick_basis);
+    else if (brick < bricks + patches)
+        exitance[brick] = patch_exitance[brick - bricks];
 }

@@ -59,8 +59,8 @@ typedef weights_t loose_weights_t __attribute__((aligned(4)));
         ADD_LAST(f, source, last)                                                                                 \
     }
 
-__kernel void gather_probes(
-    const uint probes,
+inline void gather_probe(
+    const uint probe,
     __global const uint *factor_starts,
     __global const uint *sky_starts,
     __global const uint *factor_source,
@@ -69,9 +69,6 @@ __kernel void gather_probes(
     __global const float4 *exitance,
     __global float4 *probe_cube)
 {
-    const uint probe = get_global_id(0);
-    if (probe >= probes)
-        return;
     weights_t all_red = 0.0f, all_green = 0.0f, all_blue = 0.0f;
 #if BASIS_SIZE == 9
     float4 all_last = 0.0f;
@@ -109,4 +106,19 @@ __kernel void gather_probes(
     all_last.w = 0.0f;
     probe_cube[probe * BASIS_SIZE + 8] = all_last;
 #endif
+}
+
+__kernel void gather_probes(
+    const uint probes,
+    __global const uint *factor_starts,
+    __global const uint *sky_starts,
+    __global const uint *factor_source,
+    __global const uchar *factor_code,
+    __global const float *factor_scale,
+    __global const float4 *exitance,
+    __global float4 *probe_cube)
+{
+    const uint probe = get_global_id(0);
+    if (probe < probes)
+        gather_probe(probe, factor_starts, sky_starts, factor_source, factor_code, factor_scale, exitance, probe_cube);
 }

@@ -20,14 +20,9 @@ __kernel void lamps_on_bricks(
     __global const uint *brick_starts,
     __global const float4 *surfel_albedo, // and the snow attribute
     __global const float4 *surfel_light,
-#if HAS_EMISSION
-    __global const float4 *brick_emission, // pi times the mean [lx]
-#endif
-    __global float4 *glow
-#if HAS_SNOW
-    , const float snow
-#endif
-)
+    __global const float4 *brick_emission, // pi times the mean [lx], or null
+    const float snow,
+    __global float4 *glow)
 {
     const uint brick = get_global_id(0);
     if (brick >= bricks)

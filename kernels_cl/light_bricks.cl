@@ -22,27 +22,17 @@
 #include "layout.h"
 #include "snow.h"
 
-__kernel void light_bricks(
-    const uint bricks,
-    __global float4 *direct
-#if HAS_GLOW
-    , __global const float4 *glow
-#endif
-#if DIRECTIONAL_LIGHTS > 0
-    , __global const uint *brick_starts,
+// Direct exitance of one brick. Buffers of what is not there are null.
+inline float4 light_brick(
+    const uint brick,
+    __global const float4 *glow,
+    __global const uint *brick_starts,
     __global const float4 *surfel_albedo, // and the snow attribute
     __global const float *sun_share,
-    const uint share_stride
-#if HAS_SNOW
-    , const float snow
-#endif
-    , __constant const DirectionalLight *lights
-#endif
-)
+    const uint share_stride,
+    const float snow,
+    __constant const DirectionalLight *lights)
 {
-    const uint brick = get_global_id(0);
-    if (brick >= bricks)
-        return;
 #if HAS_GLOW
     float4 sum = glow[brick];
 #else
@@ -71,5 +61,21 @@ __kernel void light_bricks(
 #endif
     sum += light * (1.0f / (float)(end - first));
 #endif
-    direct[brick] = sum;
+    return sum;
+}
+
+__kernel void light_bricks(
+    const uint bricks,
+    __global float4 *direct,
+    __global const float4 *glow,
+    __global const uint *brick_starts,
+    __global const float4 *surfel_albedo,
+    __global const float *sun_share,
+    const uint share_stride,
+    const float snow,
+    __constant const DirectionalLight *lights)
+{
+    const uint brick = get_global_id(0);
+    if (brick < bricks)
+        direct[brick] = light_brick(brick, glow, brick_starts, surfel_albedo, sun_share, share_stride, snow, lights);
 }

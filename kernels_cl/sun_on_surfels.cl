@@ -21,20 +21,17 @@
 #include "layout.h"
 #include "vectors.h"
 
-__kernel void sun_on_surfels(
+// sun_share of one group of eight surfels. Buffers of what is not there are null.
+inline void sun_on_group(
+    const uint group,
     const uint groups,
     __global const float8 *normal, // x of all groups, then y, then z
     __global const uchar *sun_visibility,
     const uint plane_bytes,
-#if HAS_SUN_MAP
     __global const uchar8 *sun_sample,
-#endif
     __global float8 *sun_share,
     __constant const DirectionalLight *lights)
 {
-    const uint group = get_global_id(0);
-    if (group >= groups)
-        return;
     const float8 x = normal[group], y = normal[groups + group], z = normal[2 * groups + group];
     const int8 bit = (int8)(1, 2, 4, 8, 16, 32, 64, 128);
     __attribute__((opencl_unroll_hint(DIRECTIONAL_LIGHTS)))
@@ -54,4 +51,18 @@ __kernel void sun_on_surfels(
         const float8 cosine = x * lights[i].direction[0] + y * lights[i].direction[1] + z * lights[i].direction[2];
         sun_share[i * groups + group] = (cosine > 0.0f ? cosine : (float8)(0.0f)) * visible;
     }
+}
+
+__kernel void sun_on_surfels(
+    const uint groups,
+    __global const float8 *normal,
+    __global const uchar *sun_visibility,
+    const uint plane_bytes,
+    __global const uchar8 *sun_sample,
+    __global float8 *sun_share,
+    __constant const DirectionalLight *lights)
+{
+    const uint group = get_global_id(0);
+    if (group < groups)
+        sun_on_group(group, groups, normal, sun_visibility, plane_bytes, sun_sample, sun_share, lights);
 }

@@ -10,7 +10,7 @@ from gi_core.relight import Relighter
 from gi_core.resident_sector import ResidentSector
 from gi_core.shadow_map import SunSamples
 
-KERNELS = ["sample_shadow_map", "sun_on_surfels", "light_bricks", "bounce_bricks", "gather_probes"]
+KERNELS = ["sample_shadow_map", "sun_on_surfels", "light_bricks", "bounce_bricks", "gather_probes", "relight_sector"]
 
 
 def test_a_quick_run_has_both_peaks_and_every_kernel_of_a_tick() -> None:

@@ -12,13 +12,15 @@ from gi_core.relight_input import RelightInput
 from gi_core.resident_sector import ResidentSector
 
 PATCHES = 6
-FEATURES = ("HAS_GLOW", "HAS_SNOW")
+FEATURES = ("HAS_GLOW", "HAS_SNOW", "HAS_SUN_MAP")
 
 
 @pytest.fixture
 def fresh() -> Device:
-    """A device for which nothing has been built yet."""
-    return Device()
+    """A device for which nothing has been built yet; a processor, as relight_sector is for those."""
+    device = Device()
+    device.is_processor = True
+    return device
 
 
 def light(lights: int, snow: float = 0.0) -> RelightInput:
@@ -53,8 +55,8 @@ def test_a_sector_under_the_sky_alone_has_nothing_else(fresh, make_sector):
     resident = lit(fresh, plain(make_sector), light(0))
     for absent in ("sun_visibility", "sun_share", "sun_sample", "brick_emission", "lamps_on_bricks"):
         assert getattr(resident, absent) is None, absent
-    assert {name for name, _ in fresh.built_kernels} == {"collect_bounces", "light_bricks", "bounce_bricks", "gather_probes"}
-    assert defines_of(fresh, "light_bricks") == {"DIRECTIONAL_LIGHTS": 0} | dict.fromkeys(FEATURES, 0)
+    assert {name for name, _ in fresh.built_kernels} == {"collect_bounces", "relight_sector"}
+    assert defines_of(fresh, "relight_sector") == {"DIRECTIONAL_LIGHTS": 0, "BASIS_SIZE": 6} | dict.fromkeys(FEATURES, 0)
     assert defines_of(fresh, "collect_bounces") == {
         "BASIS_SIZE": 6,
         "BOUNCE_ALBEDO_PERMILLE": 950,
@@ -69,15 +71,14 @@ def test_the_sun_alone_brings_its_own_buffers_and_no_shadow_map(fresh, make_sect
     assert resident.sun_visibility is not None
     assert resident.sun_share is not None
     assert resident.sun_sample is None
-    assert defines_of(fresh, "sun_on_surfels") == {"DIRECTIONAL_LIGHTS": 1, "HAS_SUN_MAP": 0}
-    assert defines_of(fresh, "light_bricks") == {"DIRECTIONAL_LIGHTS": 1} | dict.fromkeys(FEATURES, 0)
+    assert defines_of(fresh, "relight_sector") == {"DIRECTIONAL_LIGHTS": 1, "BASIS_SIZE": 6} | dict.fromkeys(FEATURES, 0)
 
 
 @pytest.mark.parametrize("snow_on_surfels", [False, True])
 def test_snowfall_builds_code_only_where_snow_can_lie(fresh, make_sector, snow_on_surfels):
     sector = make_sector(3) if snow_on_surfels else plain(make_sector)
     lit(fresh, sector, light(1, snow=0.5))
-    assert defines_of(fresh, "light_bricks")["HAS_SNOW"] == snow_on_surfels
+    assert defines_of(fresh, "relight_sector")["HAS_SNOW"] == snow_on_surfels
     assert defines_of(fresh, "collect_bounces")["HAS_SNOW"] == snow_on_surfels
 
 
@@ -88,6 +89,6 @@ def test_lamps_and_samples_are_the_code_and_bytes_that_they_ask_for(fresh, make_
     assert lamps.nbytes - without.nbytes == 16 * (sector.surfel_count + sector.brick_count)
     sampled = lit(fresh, sector, light(1), sample=True)
     assert sampled.nbytes - without.nbytes == -(-sector.surfel_count // 8) * 8
-    assert {defines["HAS_GLOW"] for name, defines in fresh.built_kernels if name == "light_bricks"} == {0, 1}
+    assert {defines["HAS_GLOW"] for name, defines in fresh.built_kernels if name == "relight_sector"} == {0, 1}
     assert defines_of(fresh, "lamps_on_bricks") == {"HAS_EMISSION": 0, "HAS_SNOW": 0}
-    assert {defines["HAS_SUN_MAP"] for name, defines in fresh.built_kernels if name == "sun_on_surfels"} == {0, 1}
+    assert {defines["HAS_SUN_MAP"] for name, defines in fresh.built_kernels if name == "relight_sector"} == {0, 1}

@@ -8,7 +8,7 @@ import pytest
 from gi_core import layout, pocl_cpu, relight_twin
 from gi_core.basis import convert
 from gi_core.constants import BASIS_SIZES
-from gi_core.device import Device, available_devices, choose_device, describe, shared_device
+from gi_core.device import Device, available_devices, choose_device, describe
 from gi_core.errors import DeviceError, InputError, KernelBuildError
 from gi_core.layout import DIRECTIONAL_LIGHT
 from gi_core.relight import Relighter
@@ -23,9 +23,13 @@ PATCHES = 6
 CLOSE = 4e-6
 
 
-@pytest.fixture(scope="module", params=[describe(d) for d in available_devices()])
+@pytest.fixture(scope="module", params=[(describe(d), phases) for d in available_devices() for phases in (False, True)], ids=str)
 def device(request) -> Device:
-    return shared_device(request.param)
+    name, by_phases = request.param
+    device = Device(name)
+    if by_phases:
+        device.is_processor = False
+    return device
 
 
 def given_light(seed: int, lights: int, planes: int = 12, snow: float = 0.0, patches: int = PATCHES) -> RelightInput:
@@ -102,6 +106,19 @@ def test_samples_of_the_shadow_map_stand_for_the_suns_baked_visibility(device, m
     assert np.abs(expected - baked).max() > 0.01 * peak
 
 
+@pytest.mark.parametrize("basis", [4, 6, 9])
+def test_one_launch_gives_the_bits_of_a_launch_for_each_phase(make_sector, basis):
+    sector, given, found = make_sector(18, basis=basis, emits=True), given_light(18, 2, snow=0.4), []
+    for by_phases in (False, True):
+        device = Device()
+        device.is_processor = not by_phases
+        resident = ResidentSector(device, sector, PATCHES)
+        Relighter(device).relight([resident], given, 5)
+        found.append(resident.read_cubes())
+        assert ("relight_sector" in dict(device.built_kernels)) != by_phases
+    np.testing.assert_array_equal(*found)
+
+
 def test_snow_comes_and_goes_without_a_trace(device, make_sector):
     resident = ResidentSector(device, make_sector(15), PATCHES)
     before = Relighter(device).converge(resident, given_light(15, 1)).cubes.tobytes()
@@ -119,13 +136,14 @@ def test_lamps_come_and_go_without_a_trace(device, make_sector):
     assert Relighter(device).converge(resident, given).cubes.tobytes() == before
 
 
-def test_two_sectors_in_one_call_equal_each_alone(device, make_sector):
+def test_sectors_in_one_call_equal_each_alone(device, make_sector):
     given = given_light(3, 1)
-    together = [ResidentSector(device, make_sector(seed), PATCHES) for seed in (1, 2)]
-    Relighter(device).relight(together, given, 4)
-    for resident in together:
+    together = [ResidentSector(device, make_sector(seed), PATCHES) for seed in (1, 2, 3)]
+    passes = (4, 1, 3)
+    Relighter(device).relight(together, given, passes)
+    for resident, count in zip(together, passes, strict=True):
         alone = ResidentSector(device, resident.sector, PATCHES)
-        Relighter(device).relight([alone], given, 4)
+        Relighter(device).relight([alone], given, count)
         np.testing.assert_array_equal(resident.read_cubes(), alone.read_cubes())
 
 
