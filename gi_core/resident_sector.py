@@ -23,13 +23,13 @@ from gi_core.constants import BASIS_SIZES
 from gi_core.device import Device
 from gi_core.layout import BOUNCE
 from gi_core.relight_input import RelightInput
+from gi_core.relight_launch import SURFELS_PER_GROUP, About, Launch, relight_launch
 from gi_core.rooms import outdoor_blend
 from gi_core.sector import Sector, starts
 
 VOXEL_GROUP = (8, 4, 1)  # work-items of fill_volume.cl along x, y, z; see SharedKernel
 # gather_probes.cl reads whole vectors, beyond the last factor's codes and the last probe's scales.
 VECTOR = 8
-SURFELS_PER_GROUP = 8  # of sun_on_surfels.cl: a byte of a plane's bits
 
 
 class LightOnDevice:
@@ -52,8 +52,10 @@ class ResidentSector:
         self.sector = sector
         self.device = device
         self.surfel_albedo = device.upload(np.concatenate([sector.surfel_albedo, sector.surfel_snow[:, None]], axis=1))
-        self._groups = -(-sector.surfel_count // SURFELS_PER_GROUP)
-        normal = np.zeros((3, SURFELS_PER_GROUP * self._groups), np.float32)
+        self.groups = -(-sector.surfel_count // SURFELS_PER_GROUP)
+        self.plane_bytes = 4 * sector.sun_visibility.shape[1]
+        self.sky_patches = sky_patches
+        normal = np.zeros((3, SURFELS_PER_GROUP * self.groups), np.float32)
         normal[:, : sector.surfel_count] = sector.surfel_normal.T
         self.surfel_normal = device.upload(normal)
         self.brick_starts = device.upload(sector.brick_starts)
@@ -76,7 +78,6 @@ class ResidentSector:
         self.sun_sample: cl.Buffer | None = None
         self.lamps_on_bricks: cl.Buffer | None = None
         self._lamps: cl.Buffer | None = None
-        self._sky_patches = sky_patches
         self._converted: tuple[str, cl.Buffer, cl.Buffer] | None = None
         self._is_cube = sector.basis_size == BASIS_SIZES["cube"]
         self._has_snow = bool(sector.surfel_snow.any())
@@ -86,6 +87,7 @@ class ResidentSector:
         self._bounces_of: float | None = None
         self._no_bounces: cl.Buffer | None = None
         self._is_lit_anew = True
+        self._launch: tuple[About, Launch] | None = None
 
     @property
     def nbytes(self) -> int:
@@ -135,8 +137,8 @@ class ResidentSector:
         """
         if self.sector.probe_count == 0:
             return
-        if light is not self._light and len(light.given.patch_exitance) != self._sky_patches:
-            raise ValueError(f"expected the exitance of {self._sky_patches} sky patches, got {len(light.given.patch_exitance)}")
+        if light is not self._light and len(light.given.patch_exitance) != self.sky_patches:
+            raise ValueError(f"expected the exitance of {self.sky_patches} sky patches, got {len(light.given.patch_exitance)}")
         self._light = light
         if self.sector.brick_count == 0:
             return
@@ -210,49 +212,20 @@ class ResidentSector:
             cl.enqueue_copy(self.device.queue, self.cubes, padded)
 
     def _relight(self, queue: cl.CommandQueue, passes: int, bounce_starts: cl.Buffer | None, cubes: cl.Buffer) -> None:
-        """Direct light if it is another than before, then passes over ``cubes``."""
-        sector, light = self.sector, self._light
+        light = self._light
         assert light is not None
-        lights, snow = len(light.given.lights), light.given.snow if self._has_snow else 0.0
         glow = self.brick_emission if self.lamps_on_bricks is None else self.lamps_on_bricks
-        groups, bricks, probes = np.uint32(self._groups), np.uint32(sector.brick_count), np.uint32(sector.probe_count)
-        plane_bytes = np.uint32(4 * sector.sun_visibility.shape[1])
-        sun_defines = {"DIRECTIONAL_LIGHTS": lights, "HAS_SUN_MAP": int(lights > 0 and self.sun_sample is not None)}
-        sun = (groups, self.surfel_normal, self.sun_visibility, plane_bytes, self.sun_sample, self.sun_share)
-        surfels = (glow, self.brick_starts, self.surfel_albedo)
-        brick_defines = {"DIRECTIONAL_LIGHTS": lights, "HAS_GLOW": int(glow is not None), "HAS_SNOW": int(lights > 0 and snow > 0)}
-        basis = {"BASIS_SIZE": sector.basis_size}
-        patches, bounces = np.uint32(self._sky_patches), (bounce_starts, self.bounces)
-        factors = (self.factor_starts, self.sky_starts, self.factor_source, self.factor_code, self.factor_scale)
-        run = self.device.shared_kernel
-        if self.device.is_processor:
-            run("relight_sector", **(sun_defines | brick_defines | basis)).launch(
-                (1,),
-                (1,),
-                *(np.uint32(self._is_lit_anew), np.uint32(passes)),
-                *sun,
-                *(bricks, self.direct, *surfels, np.float32(snow), light.lights),
-                *(patches, *bounces, self.brick_basis, self.exitance, light.patches),
-                *(probes, *factors, cubes),
-                queue=queue,
-            )
-        else:
-            if self._is_lit_anew and bricks:
-                if lights:
-                    run("sun_on_surfels", **sun_defines).launch_1d(self._groups, *sun, light.lights, queue=queue)
-                share = (self.sun_share, np.uint32(self._groups * SURFELS_PER_GROUP), np.float32(snow), light.lights)
-                run("light_bricks", **brick_defines).launch_1d(sector.brick_count, bricks, self.direct, *surfels, *share, queue=queue)
-            bounced = (*bounces, self.direct, cubes, self.brick_basis, self.exitance, light.patches)
-            for _ in range(passes):
-                items = sector.brick_count + self._sky_patches
-                run("bounce_bricks", **basis).launch_1d(items, bricks, patches, *bounced, queue=queue)
-                run("gather_probes", **basis).launch_1d(sector.probe_count, probes, *factors, self.exitance, cubes, queue=queue)
+        snow = light.given.snow if self._has_snow else 0.0
+        about = About(len(light.given.lights), snow, glow, self.sun_sample, self.sun_share, self.bounces, bounce_starts, cubes)
+        if self._launch is None or self._launch[0] != about:
+            self._launch = about, relight_launch(self, about)
+        self._launch[1](queue, passes, self._is_lit_anew, light)
         self._is_lit_anew = False
 
     def _make_room_for_sun(self, lights: int) -> None:
         if self.sun_visibility is None:
             self.sun_visibility = self.device.upload(self.sector.sun_visibility)
-        nbytes = lights * self._groups * SURFELS_PER_GROUP * 4
+        nbytes = lights * self.groups * SURFELS_PER_GROUP * 4
         if self.sun_share is None or self.sun_share.size < nbytes:
             self.sun_share = self.device.allocate(nbytes)
 
@@ -281,7 +254,7 @@ class ResidentSector:
 
         def collect(bounce_starts: cl.Buffer, bounces: cl.Buffer) -> None:
             last = [np.float32(snow)] if snow > 0 else []
-            surfels = [self.surfel_normal, np.uint32(self._groups * SURFELS_PER_GROUP)] if self._is_cube else []
+            surfels = [self.surfel_normal, np.uint32(self.groups * SURFELS_PER_GROUP)] if self._is_cube else []
             bricks = np.uint32(sector.brick_count)
             read = (self.brick_starts, self.surfel_albedo, *surfels, probe, *weight)
             kernel.launch_1d(sector.brick_count, bricks, *read, bounce_starts, bounces, count, *last)

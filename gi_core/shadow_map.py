@@ -15,7 +15,8 @@ from gi_core.constants import SURFEL_CELL_M
 from gi_core.device import Device
 from gi_core.grid import SectorIndex
 from gi_core.layout import NO_SAMPLE, SHADOW_ROW_TEXELS
-from gi_core.resident_sector import SURFELS_PER_GROUP, ResidentSector
+from gi_core.relight_launch import SURFELS_PER_GROUP
+from gi_core.resident_sector import ResidentSector
 from gi_core.sector import counts
 from gi_core.shadow_plan import MAP_TEXELS, ShadowPlan, box_corners, oldest_fresh, triangle_records
 

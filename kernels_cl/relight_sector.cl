@@ -4,6 +4,8 @@
 // For processors. Between two kernels of a queue PoCL takes some 10 us to put threads to sleep and to wake them, as long as a kernel works
 // on half a sector; here a sector's data stay with one core, and another has the tick's other sector.
 //
+// The global id is 2 * passes, and one more if the light is another than at the last launch: so all arguments can stay set.
+//
 // Defines: those of the four.
 #include "bounce_bricks.cl"
 #include "gather_probes.cl"
@@ -13,8 +15,6 @@
 #endif
 
 __kernel void relight_sector(
-    const uint is_lit_anew, // the light is another than at the last launch
-    const uint passes,
     const uint groups,
     __global const float8 *normal,
     __global const uchar *sun_visibility,
@@ -27,21 +27,23 @@ __kernel void relight_sector(
     __global const uint *brick_starts,
     __global const float4 *surfel_albedo,
     const float snow,
-    __constant const DirectionalLight *lights,
     const uint patches,
     __global const uint *bounce_starts,
     __global const Bounce *bounces,
     __global const float *brick_basis,
     __global float4 *exitance,
-    __global const float4 *patch_exitance,
     const uint probes,
     __global const uint *factor_starts,
     __global const uint *sky_starts,
     __global const uint *factor_source,
     __global const uchar *factor_code,
     __global const float *factor_scale,
-    __global float4 *probe_cube)
+    __global float4 *probe_cube,
+    __constant const DirectionalLight *lights,
+    __global const float4 *patch_exitance)
 {
+    const uint passes = get_global_id(0) / 2;
+    const bool is_lit_anew = get_global_id(0) % 2;
     if (is_lit_anew) {
 #if DIRECTIONAL_LIGHTS > 0
         for (uint group = 0; group < groups; ++group)
