@@ -79,6 +79,7 @@ def bench_roofline(device: Device, rounds: int = 40) -> list[Measurement]:
     seconds: dict[str, list[float]] = {}
     for is_processor in {device.is_processor, False}:
         device.is_processor = is_processor
+        ticks = Ticks(device, snowy_sectors())
         for _ in range(ROTATION):
             ticks.everything()
         device.launched.clear()
