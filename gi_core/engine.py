@@ -359,7 +359,7 @@ class Engine:
         return found
 
     def _resident_bytes(self) -> int:
-        return sum(held.nbytes for kept in (self._residents, self._fine) for held in kept.values())
+        return sum(held.nbytes for kept in (self._residents, self._fine, self._lights) for held in kept.values())
 
     def _expect_inside(self, position: Float64) -> None:
         low, high = self.dataset.world.bounds
