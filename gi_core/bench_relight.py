@@ -93,8 +93,8 @@ class Ticks:
         rng = np.random.default_rng(0)
         places = rng.uniform(0, 64, (LAMPS, 3)).tolist()
         self.lamps = [Lamp(str(i), "point", (x, y, z), 8000.0, range_m=40.0) for i, (x, y, z) in enumerate(places)]
-        shadows = ShadowGeometry(lambda _: city, {here})
-        self.surfel_lights = [SurfelLights(device, sector, shadows) for sector in sectors]
+        self.shadows = ShadowGeometry(lambda _: city, {here})
+        self.surfel_lights = [SurfelLights(device, sector, self.shadows) for sector in sectors]
         for resident, lights in zip(self.residents, self.surfel_lights, strict=True):
             lights.set_dynamic(self.lamps)
             resident.set_lamps(lights.buffer)

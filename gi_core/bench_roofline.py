@@ -72,7 +72,7 @@ def bench_roofline(device: Device, rounds: int = 40) -> list[Measurement]:
     """One row for STREAM, one for the FMA loop, one for each kernel: its time on one sector beside its bound, whose ratio is the
     fraction reached. ``device`` is a timed one of its own."""
     ticks = Ticks(device, snowy_sectors())
-    held = sum(resident.nbytes for resident in ticks.residents)
+    held = sum(part.nbytes for parts in (ticks.residents, ticks.samples, ticks.surfel_lights) for part in parts)
     triad, bytes_a_second = _peak_bytes(device, held, rounds)
     fma, flops_a_second = _peak_flops(device, rounds)
     assert device.launched is not None

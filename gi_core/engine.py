@@ -2,6 +2,7 @@
 
 import threading
 from collections import OrderedDict
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -86,6 +87,14 @@ class _Light:
     digest: str
 
 
+@dataclass(frozen=True, eq=False)
+class _Lit:
+    """A sector's probes (P, B, 3) float32 [lx] under a light, and how far their bounces are from their fixed point (relight.Converged)."""
+
+    cubes: Float32
+    residual: float
+
+
 class Engine:
     """Lights sectors of one dataset on one device. Safe to call from several threads; the device is used by one at a time."""
 
@@ -104,7 +113,7 @@ class Engine:
         self._lights: dict[SectorIndex, SurfelLights] = {}
         self._fine: dict[SectorIndex, ResidentGrid] = {}
         self._coarse = KeptCoarse()
-        self._lit: OrderedDict[tuple[str, Settings, SectorIndex], Float32] = OrderedDict()
+        self._lit: OrderedDict[tuple[str, Settings, SectorIndex], _Lit] = OrderedDict()
 
     @property
     def device_name(self) -> str:
@@ -121,14 +130,14 @@ class Engine:
 
         Raises SectorMissingError, CorruptFileError.
         """
-        return self._lit_sector(index, self._light(lighting, settings))
+        return self._lit_sector(index, self._light(lighting, settings)).cubes
 
     def _light(self, lighting: Lighting, settings: Settings) -> _Light:
         """What a query is lit by, worked out once for all its sectors."""
         lamps = lamps_on(self.lamps, lighting)
         return _Light(lighting, lamps, settings, lighting.digest + lamps_digest(lamps))
 
-    def _lit_sector(self, index: SectorIndex, light: _Light) -> Float32:
+    def _lit_sector(self, index: SectorIndex, light: _Light) -> _Lit:
         key = (light.digest, light.settings, index)
         with self._lock:
             if key in self._lit:
@@ -142,10 +151,14 @@ class Engine:
             cubes = settings.cubes(found.first_bounce, found.cubes, resident.sector.probe_room)
             # Every later query gets this very array.
             cubes.setflags(write=False)
-            self._lit[key] = cubes
+            lit = self._lit[key] = _Lit(cubes, found.residual)
             while len(self._lit) > LIT_SECTORS:
                 self._lit.popitem(last=False)
-            return cubes
+            return lit
+
+    def _residual(self, sectors: Iterable[SectorIndex], light: _Light) -> float:
+        """The greatest of some sectors, at least one."""
+        return max(self._lit_sector(index, light).residual for index in sectors)
 
     def volume(
         self, position: Float64, lighting: Lighting, settings: Settings = NEUTRAL, basis: str | None = None, cascade: int = 0
@@ -174,7 +187,8 @@ class Engine:
         for box in unlit:  # it has air, but no probe: lit like columns without a sector, by the nearest that are
             has_light[box_slices(box)[1:]] = False
         _fill_columns(values, has_light)
-        return Volume(values, mask, first, tuple(box.index for box in boxes), basis, self._expected_error(basis))
+        sectors = tuple(box.index for box in boxes)
+        return Volume(values, mask, first, sectors, basis, self._expected_error(basis), residual=self._residual(sectors, light))
 
     def _empty_volume(self, position: Float64, first: Int64, basis: str) -> tuple[list[SectorBox], Float32, UInt8]:
         """What a volume reads, at least one box, and its light and mask to be filled. Raises OutsideWorldError."""
@@ -207,7 +221,8 @@ class Engine:
                 fine.fill(box, target, resident.converted(basis), basis)
                 self._device.read(target, filled)
             merge(fine, box, filled, values, mask)
-        return Volume(values, mask, first, tuple(box.index for box in boxes), basis, self._expected_error(basis, -1), cascade=-1)
+        sectors = tuple(box.index for box in boxes)
+        return Volume(values, mask, first, sectors, basis, self._expected_error(basis, -1), cascade=-1, residual=coarse.residual)
 
     def _coarse_volume(self, position: Float64, light: _Light, basis: str, cascade: int) -> Volume:
         first = volume_first_voxel(position, cascade)
@@ -218,15 +233,16 @@ class Engine:
         # Sectors on the device first: where not all fit, loading one would drop the next.
         for index in sorted(sectors, key=lambda index: index not in self._residents):
             with self._lock:  # sector by sector: other queries wait for one, not for all
-                cubes = self._lit_sector(index, light)
-                parts[index] = self._coarse.get(index, cascade, lambda index: self._resident(index).sector), cubes
+                lit = self._lit_sector(index, light)
+                parts[index] = self._coarse.get(index, cascade, lambda index: self._resident(index).sector), lit
         sums = CoarseSums(first, BASIS_SIZES[basis])
         for index in sectors:
-            voxels, cubes = parts[index]
-            sums.add(voxels, convert(cubes, self.dataset.world.basis, basis))
+            voxels, lit = parts[index]
+            sums.add(voxels, convert(lit.cubes, self.dataset.world.basis, basis))
         values, mask, has_light = sums.finish()
         _fill_columns(values, has_light)
-        return Volume(values, mask, first, tuple(sectors), basis, self._expected_error(basis, cascade), cascade)
+        residual = max(lit.residual for _, lit in parts.values())
+        return Volume(values, mask, first, tuple(sectors), basis, self._expected_error(basis, cascade), cascade, residual)
 
     def interior(
         self,
@@ -250,6 +266,7 @@ class Engine:
         boxes, values, mask = self._empty_volume(position, first, basis)
         lit_rooms = np.full(VOLUME_SHAPE, ROOM_OUTDOORS, np.uint16)
         reached: set[int] = set()
+        lit: list[SectorIndex] = []
         with self._lock:
             target = self._device.allocate(values.nbytes)
             for box in boxes:
@@ -262,6 +279,7 @@ class Engine:
                 reached.update(np.unique(room_here[kind == VOXEL_INDOORS]).tolist())
                 lit_rooms[box_slices(box)] = box_rooms(box, sector, rooms_with_light(sector))
                 if sector.probe_count:
+                    lit.append(box.index)
                     resident = self._lit_resident(box.index, light)
                     grid = VoxelGrid(sector.voxel_first, sector.voxel_class, sector.voxel_probe, sector.voxel_weight)
                     ResidentGrid(self._device, grid).fill(box, target, resident.converted(basis), basis)
@@ -272,7 +290,8 @@ class Engine:
             lacks = f"has no probe in {there}" if reached else f"reaches no voxel of {there}; GET /v1/world lists rooms"
             raise InputError(f"kind=interior: the volume around this place {lacks}")
         values = np.ascontiguousarray(values[(slice(None), *nearest(inside))])
-        return Volume(values, mask, first, tuple(box.index for box in boxes), basis, rooms=tuple(sorted(reached)))
+        sectors, residual = tuple(box.index for box in boxes), self._residual(lit, light)
+        return Volume(values, mask, first, sectors, basis, residual=residual, rooms=tuple(sorted(reached)))
 
     def distant(self, lighting: Lighting) -> Distant:
         """One texel per sector of the whole world, lit by the sky alone (slide "Distant shading"). Raises CorruptFileError."""
@@ -294,7 +313,7 @@ class Engine:
         light = self._light(lighting, NEUTRAL)
         for index in sorted(touched, key=lambda i: (i.z, i.x)):
             with self._lock:
-                cubes = self._lit_sector(index, light)
+                cubes = self._lit_sector(index, light).cubes
                 sector = self._resident(index).sector
             world = sector.probe_position + index.origin
             own = sector.probe_flags & PROBE_IN_MARGIN == 0
@@ -318,7 +337,7 @@ class Engine:
 
     def _lit_resident(self, index: SectorIndex, light: _Light) -> ResidentSector:
         """A sector on the device, with its probes lit."""
-        cubes = self._lit_sector(index, light)
+        cubes = self._lit_sector(index, light).cubes
         resident = self._resident(index)
         resident.write_cubes(cubes)
         return resident
@@ -359,7 +378,7 @@ class Engine:
         return found
 
     def _resident_bytes(self) -> int:
-        return sum(held.nbytes for kept in (self._residents, self._fine) for held in kept.values())
+        return sum(held.nbytes for kept in (self._residents, self._fine, self._lights) for held in kept.values())
 
     def _expect_inside(self, position: Float64) -> None:
         low, high = self.dataset.world.bounds

@@ -31,6 +31,11 @@ class Measured:
     high_lx: float
     source: str
 
+    @property
+    def bounds_lx(self) -> tuple[float, float]:
+        """What the model is held to [lx]: the published range and its spread either side."""
+        return self.low_lx / SPREAD, self.high_lx * SPREAD
+
 
 @dataclass(frozen=True)
 class Row:
@@ -43,7 +48,7 @@ class Row:
     @property
     def excess(self) -> float:
         """By what factor the model lies outside the literature and its spread: 1 inside, above 1 too bright, below 1 too dark."""
-        low, high = self.literature.low_lx / SPREAD, self.literature.high_lx * SPREAD
+        low, high = self.literature.bounds_lx
         return max(self.model_lx / high, 1.0) * min(self.model_lx / low, 1.0)
 
 
@@ -60,7 +65,7 @@ LITERATURE = {
     "sun at -6 degrees": Measured(2, 3.5, _AMS),
     "sun at -12 degrees": Measured(0.0049, 0.0101, f"{_USNO}; {_SUPPLEMENT}, each with its own night"),
     "sun at -18 degrees": Measured(5.1e-4, 2.64e-3, f"{_USNO}; {_SUPPLEMENT}, each with its own night"),
-    "full moon at 66 degrees": Measured(0.2, 0.32, "Spitschan et al. 2016; Kyba et al. 2017"),
+    "full moon at 66 degrees": Measured(0.2, 0.32, "Spitschan et al. 2016; Kyba et al. 2017, their most: a high moon"),
     "new moon": Measured(5e-4, 2e-3, f"{_USNO}; {_SUPPLEMENT}"),
 }
 
@@ -98,12 +103,15 @@ def lighting_table() -> list[Row]:
 
 def main() -> None:
     """Print the table as Markdown."""
-    print("| clear sky | model [lx] | literature [lx] | source |\n|---|---|---|---|")
+    print("| clear sky | model [lx] | held to [lx] | literature [lx] | source |\n|---|---|---|---|---|")
     for row in lighting_table():
-        model, low, high = (
-            f"{lux:,.0f}" if lux >= 100 else f"{lux:.3g}" for lux in (row.model_lx, row.literature.low_lx, row.literature.high_lx)
-        )
-        print(f"| {row.state} | {model} | {low} - {high} | {row.literature.source} |")
+        published = row.literature
+        held, found = (f"{_text(low)} - {_text(high)}" for low, high in (published.bounds_lx, (published.low_lx, published.high_lx)))
+        print(f"| {row.state} | {_text(row.model_lx)} | {held} | {found} | {published.source} |")
+
+
+def _text(lux: float) -> str:
+    return f"{lux:,.0f}" if lux >= 100 else f"{lux:.3g}"
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """The relighter: passes over resident sectors, a few each tick or until nothing moves any more (slide "Relighting")."""
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -8,8 +9,11 @@ import numpy as np
 from gi_core.arrays import Float32
 from gi_core.basis import FEEDBACK, basis_of_size
 from gi_core.device import Device
+from gi_core.grid import SectorIndex
 from gi_core.relight_input import RelightInput
 from gi_core.resident_sector import LightOnDevice, ResidentSector
+
+log = logging.getLogger("sectorlight.relight")
 
 # A query's light is this close to the fixed point of its bounces, as a share of the brightest value. Float32 sums of some hundred
 # factors are good to 1e-6.
@@ -42,6 +46,7 @@ class Relighter:
     def __init__(self, device: Device) -> None:
         self.device = device
         self._light: LightOnDevice | None = None
+        self._told_of: set[SectorIndex] = set()
 
     def relight(self, residents: Sequence[ResidentSector], given: RelightInput, passes: int | Sequence[int] = 1) -> None:
         """Enqueue passes over sectors, as many for each or a number of its own; each pass adds one bounce to the cubes that a sector holds.
@@ -67,7 +72,8 @@ class Relighter:
     def converge(self, resident: ResidentSector, given: RelightInput, residual: float = QUERY_RESIDUAL) -> Converged:
         """Relight a sector from darkness until what later bounces could still add is below ``residual`` times the peak.
 
-        The remaining distance is estimated from how fast the change shrinks: change * rate / (1 - rate), as for any contraction.
+        The remaining distance is estimated from how fast the change shrinks: change * rate / (1 - rate), as for any contraction. Where
+        MAX_PASSES were not enough the light is returned as it is, and the log tells so, once for a sector.
         """
         sector = resident.sector
         after = np.zeros((sector.probe_count, sector.basis_size, 3), np.float32)
@@ -91,4 +97,13 @@ class Relighter:
             left, last_change = change * rate / (1 - rate) / peak, change
             if left <= residual:
                 break
+        if left > residual and sector.index not in self._told_of:
+            self._told_of.add(sector.index)
+            log.warning(
+                "sector %s: bounces given up after %d passes, %.1e of the brightest value from their fixed point; expected %.1e",
+                f"{sector.index.x},{sector.index.z}",
+                passes,
+                left,
+                residual,
+            )
         return Converged(after, first, left, passes)

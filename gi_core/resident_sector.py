@@ -30,6 +30,8 @@ from gi_core.sector import Sector, starts
 VOXEL_GROUP = (8, 4, 1)  # work-items of fill_volume.cl along x, y, z; see SharedKernel
 # gather_probes.cl reads whole vectors, beyond the last factor's codes and the last probe's scales.
 VECTOR = 8
+# Buffers that a resident sector reads and others hold: SunSamples and SurfelLights count them.
+_LENT = ("sun_sample", "_lamps")
 
 
 class LightOnDevice:
@@ -91,8 +93,8 @@ class ResidentSector:
 
     @property
     def nbytes(self) -> int:
-        """Bytes on the device."""
-        own = sum(value.size for value in vars(self).values() if isinstance(value, cl.Buffer))
+        """Bytes on the device, without what is lent to it: lamps' light and samples of the sun."""
+        own = sum(value.size for name, value in vars(self).items() if isinstance(value, cl.Buffer) and name not in _LENT)
         return own + (sum(buffer.size for buffer in self._converted[1:]) if self._converted else 0)
 
     def prepare(self) -> None:

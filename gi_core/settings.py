@@ -1,4 +1,4 @@
-"""The artists' panel (slide "Ease of use"): nine numbers, each with a physical meaning and a neutral default.
+"""The artists' panel (slide "Ease of use"): ten numbers and colours, each with a physical meaning and a neutral default.
 
 Light transport is linear, so gains on the sources are gains on what they give, and none of them touches the loop of bounces: no
 setting can make it diverge. The bounce gain acts on the sum of all bounces after it has converged.

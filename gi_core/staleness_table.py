@@ -120,14 +120,7 @@ def _measured(
     places: int,
 ) -> Row:
     player = TickPlayers(("one",), position[None], np.zeros((1, 3)))
-    warm, quiet = 0, 0
-    settled = _light(world, track.at(begin, 0.0), lamps_at(0), standing=True)
-    while quiet < QUIET_TICKS and warm < MOST_WARM_TICKS:
-        report = world.tick(warm, player, settled)
-        at_work = report.missing or world.streamer.loading or report.relit or report.settled or report.filled
-        quiet = 0 if at_work or world.published("one") is None else quiet + 1
-        warm += 1
-        time.sleep(0.001)  # loaders are threads
+    warm = settle(world, 0, player, live_light(world, track.at(begin, 0.0), lamps_at(0), standing=True))
     errors, biases, before, changes = [], [], None, []
     due = set(np.linspace(RUN_TICKS // 2, RUN_TICKS - 1, CHECKS).astype(int).tolist())
     for step in range(RUN_TICKS):
@@ -136,7 +129,7 @@ def _measured(
         if lamps_at(step) != lamps_at(step - 1):
             world.lamps_moved([(np.array(lamp.position), lamp.range_m) for lamp in lamps_at(step)])
         if places > 1 or step % 2 == 0:
-            world.tick(warm + step, player, _light(world, lighting, lamps_at(step), standing=False))
+            world.tick(warm + step, player, live_light(world, lighting, lamps_at(step), standing=False))
         if step not in due:
             continue
         engine.lamps = lamps_at(step)
@@ -154,7 +147,20 @@ def _measured(
     return Row(moves, places, float(np.median(found)), float(np.quantile(found, 0.95)), float(np.mean(biases)), float(np.median(changes)))
 
 
-def _light(world: LiveWorld, lighting: Lighting, lamps: tuple[Lamp, ...], standing: bool) -> LiveLight:
+def settle(world: LiveWorld, tick: int, players: TickPlayers, light: LiveLight) -> int:
+    """Ticks from this one on until nothing has been done for some; the number of the next."""
+    quiet, last = 0, tick + MOST_WARM_TICKS
+    while quiet < QUIET_TICKS and tick < last:
+        report = world.tick(tick, players, light)
+        at_work = report.missing or world.streamer.loading or report.relit or report.settled or report.filled
+        quiet = 0 if at_work or world.published(players.ids[0]) is None else quiet + 1
+        tick += 1
+        time.sleep(0.001)  # loaders are threads
+    return tick
+
+
+def live_light(world: LiveWorld, lighting: Lighting, lamps: tuple[Lamp, ...], standing: bool) -> LiveLight:
+    """A tick's light: dynamic lamps, those that are on, and settings that change nothing."""
     info = world.dataset.world
     given = relight_input(lighting, info.sun_table, info.sky, info.sky_patches)
     return LiveLight(lighting, given, LightVector.of(given), (), lamps_on(lamps, lighting), NEUTRAL, standing)
@@ -164,16 +170,21 @@ def _luminance(values: Float32) -> Float32:
     return np.asarray(values @ LUMINANCE_FROM_RGB.astype(np.float32), np.float32)
 
 
+def parse_position(text: str) -> Float64:
+    """(3,) [m] from X,Y,Z. Raises InputError."""
+    parts = text.split(",")
+    if len(parts) != 3:
+        raise InputError(f"position: expected X,Y,Z as in 48,4,3, found {text[:40]!r}")
+    return np.array([float(part) for part in parts])
+
+
 def main() -> None:
     """Print the table as Markdown."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("dataset", type=Path)
     parser.add_argument("position", help="X,Y,Z [m]")
     given = parser.parse_args()
-    parts = given.position.split(",")
-    if len(parts) != 3:
-        raise InputError(f"position: expected X,Y,Z as in 48,4,3, found {given.position[:40]!r}")
-    rows = staleness_table(Dataset.open(given.dataset), np.array([float(part) for part in parts]))
+    rows = staleness_table(Dataset.open(given.dataset), parse_position(given.position))
     titles = ("what moves", "converged light moves by, in a second", "sectors a tick", "median", "95th percentile", "bias")
     print(f"| {' | '.join(titles)} |\n" + "|---" * len(titles) + "|")
     for row in rows:

@@ -23,6 +23,7 @@ class Volume:
     sectors : those that it was filled from
     expected_error : median relative error that the dataset's error report gives, or None without a report
     cascade : its voxels are VOXEL_SIZE_M times 2 to this
+    residual : what later bounces could still add at most, as a share of a sector's brightest value; None of a live volume
     rooms : numbers of the rooms that an interior volume reaches: its mask says VOXEL_INDOORS there and nowhere else; none outdoors
     """
 
@@ -33,6 +34,7 @@ class Volume:
     basis: str = "cube"
     expected_error: float | None = None
     cascade: int = 0
+    residual: float | None = None
     rooms: tuple[int, ...] = ()
 
     @property

@@ -1,6 +1,7 @@
 """The irradiance volume around a point."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Annotated, Any
 
 import numpy as np
@@ -52,6 +53,7 @@ def volume(request: Request, service: ServiceDep, query: Annotated[VolumeQuery, 
     `cascade=1..3`: voxels of twice, four and eight times the size, means of those inside them; `-1`: of half the size, where `/v1/world`
     says so. Each cascade covers the middle of the next: blend from one to the other over the last two voxels of the smaller.
     `mask=1`: uint8 (16, 32, 32), 0 solid, 1 outdoors, 2 indoors, 3 no sector there. The header `Gi-Volume` places it in the world.
+    The header `Gi-Residual` is what later bounces could still add, as a share of a sector's brightest value: seldom more than 1e-5.
     """
     laps = Laps()
     with laps.lap("light"):
@@ -67,7 +69,8 @@ def volume(request: Request, service: ServiceDep, query: Annotated[VolumeQuery, 
                 found = service.engine.volume(query.position, light, basis=basis, cascade=query.cascade)
         with laps.lap("encode"):
             rooms = service.dataset.world.rooms
-            return mask_body(found, query, rooms) if query.mask else light_body(found, query, rooms, is_fog=query.kind == "fog")
+            body = mask_body(found, query, rooms) if query.mask else light_body(found, query, rooms, is_fog=query.kind == "fog")
+        return replace(body, headers={**body.headers, "Gi-Residual": f"{found.residual:.2g}"})
 
     return conditional(request, etag, compute, laps=laps)
 

@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 
 from gi_core import engine as engine_module
-from gi_core import sector_file
+from gi_core import relight, sector_file
 from gi_core.constants import VOXEL_NO_SECTOR, VOXEL_OUTDOORS, VOXEL_SOLID
 from gi_core.dataset import Dataset, sector_path
 from gi_core.engine import Engine
 from gi_core.errors import CorruptFileError, OutsideWorldError, SectorMissingError
 from gi_core.grid import SectorIndex
 from gi_core.sector import PROBE_IN_MARGIN, starts
+from gi_core.volume import Volume
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 HERE, THERE = SectorIndex(0, 0), SectorIndex(-1, 0)  # the golden dataset's sectors: x of 0..64 m and of -64..0 m
@@ -54,6 +55,20 @@ def plane(tmp_path_factory, build) -> Engine:
     folder = tmp_path_factory.mktemp("plane")
     make_golden().write_golden(folder, scene=build().ground((-64, 0), (128, 128), albedo=0.3).scene())
     return Engine(Dataset.open(folder))
+
+
+def test_a_volume_says_how_far_its_bounces_are_from_their_fixed_point(engine, monkeypatch):
+    settled = [volume.residual for volume in every_kind(engine)]
+    assert all(residual is not None and 0 <= residual <= relight.QUERY_RESIDUAL for residual in settled)
+    monkeypatch.setattr(relight, "MAX_PASSES", 5)
+    given_up = [volume.residual for volume in every_kind(Engine(engine.dataset))]
+    assert all(residual is not None and residual > relight.QUERY_RESIDUAL for residual in given_up)
+
+
+def every_kind(engine: Engine) -> list[Volume]:
+    light, room = engine.lighting(*NOON), engine.dataset.world.rooms[0]
+    inside = (np.array(room.minimum) + np.array(room.maximum)) / 2
+    return [engine.volume(STREET, light), engine.volume(STREET, light, cascade=1), engine.interior(inside, light)]
 
 
 def everything(engine: Engine, query: tuple[str, float, float, tuple[str, str]]) -> bytes:

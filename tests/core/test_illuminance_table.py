@@ -102,10 +102,14 @@ def test_elevations_are_found_to_the_second() -> None:
     assert sun_position(PLACE, time_of_elevation(5.0)).true_elevation_degrees == pytest.approx(5.0, abs=0.005)
 
 
-def test_the_command_prints_every_row(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_prints_every_row_beside_the_range_that_it_is_held_to(capsys: pytest.CaptureFixture[str]) -> None:
     main()
-    printed = capsys.readouterr().out
-    assert all(f"| {state} |" in printed for state in LITERATURE)
+    rows = [line.strip("| ").split(" | ") for line in capsys.readouterr().out.replace(",", "").splitlines()[2:]]
+    assert [row[0] for row in rows] == [state.replace(",", "") for state in LITERATURE]
+    for _, model, held, published, *_ in rows:
+        (low, high), (least, most) = ([float(end) for end in ends.split(" - ")] for ends in (held, published))
+        assert low <= float(model) <= high
+        assert low < least < most < high
 
 
 def test_the_table_of_math_md_is_what_the_command_prints(capsys: pytest.CaptureFixture[str]) -> None:

@@ -90,6 +90,7 @@ def test_a_volume_is_where_its_header_says(http: httpx.Client, moment: dict[str,
     assert facts["voxel_size"] == [VOXEL_SIZE_M] * 3
     assert facts["sectors"]
     assert 0 < facts["valid"] <= 1
+    assert 0 <= float(reply.headers["Gi-Residual"]) <= 1e-5
     origin = np.array(facts["origin"])
     centre = origin + VOXEL_SIZE_M * (np.array([32, 16, 32]) - 1) / 2
     assert (np.abs(centre - [place["x"], place["y"], place["z"]]) <= VOXEL_SIZE_M).all()

@@ -1,15 +1,21 @@
 """What a scene does not have has no buffer on the device, and no kernel is built for it."""
 
 from dataclasses import replace
+from threading import Lock
 
 import numpy as np
+import pyopencl as cl
 import pytest
 
+from gi_core.bench_relight import made_up_city
 from gi_core.device import Device
 from gi_core.layout import DIRECTIONAL_LIGHT
+from gi_core.light_geometry import ShadowGeometry
+from gi_core.live_sector import LiveSector
 from gi_core.relight import Relighter
 from gi_core.relight_input import RelightInput
 from gi_core.resident_sector import ResidentSector
+from gi_core.world import Lamp
 
 PATCHES = 6
 FEATURES = ("HAS_GLOW", "HAS_SNOW", "HAS_SUN_MAP")
@@ -82,13 +88,29 @@ def test_snowfall_builds_code_only_where_snow_can_lie(fresh, make_sector, snow_o
     assert defines_of(fresh, "collect_bounces")["HAS_SNOW"] == snow_on_surfels
 
 
-def test_lamps_and_samples_are_the_code_and_bytes_that_they_ask_for(fresh, make_sector):
+def test_lamps_and_samples_are_the_code_that_they_ask_for_and_their_makers_bytes(fresh, make_sector):
     sector = plain(make_sector)
     without = lit(fresh, sector, light(1))
     lamps = lit(fresh, sector, light(1), lamps=True)
-    assert lamps.nbytes - without.nbytes == 16 * (sector.surfel_count + sector.brick_count)
+    assert lamps.nbytes - without.nbytes == 16 * sector.brick_count
     sampled = lit(fresh, sector, light(1), sample=True)
-    assert sampled.nbytes - without.nbytes == -(-sector.surfel_count // 8) * 8
+    assert sampled.nbytes == without.nbytes
     assert {defines["HAS_GLOW"] for name, defines in fresh.built_kernels if name == "relight_sector"} == {0, 1}
     assert defines_of(fresh, "lamps_on_bricks") == {"HAS_EMISSION": 0, "HAS_SNOW": 0}
     assert {defines["HAS_SUN_MAP"] for name, defines in fresh.built_kernels if name == "relight_sector"} == {0, 1}
+
+
+def test_a_live_sector_counts_each_buffer_once(fresh, make_sector):
+    sector = plain(make_sector)
+    live = LiveSector(fresh, sector, PATCHES, ShadowGeometry(lambda _: made_up_city(), {sector.index}), Lock())
+    x, y, z = (sector.index.origin + sector.surfel_position[0] + sector.surfel_normal[0]).tolist()
+    live.lamps.set_static([Lamp("lamp", "point", (x, y, z), 1e3)])
+    live.resident.set_lamps(live.lamps.buffer)
+    live.make_room_for_samples()
+    live.resident.set_sun_sample(live.samples.sun_sample)
+    Relighter(fresh).relight([live.resident], light(1))
+    held = [vars(part).values() for part in (live.resident, live.lamps, live.lamps._bits, live.samples)]
+    buffers = {buffer.int_ptr: buffer.size for values in held for buffer in values if isinstance(buffer, cl.Buffer)}
+    assert live.resident.sun_sample.int_ptr in buffers
+    assert live.lamps.buffer.int_ptr in buffers
+    assert live.nbytes == sum(buffers.values())

@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gi_core import layout, pocl_cpu, relight_twin
+from gi_core import layout, pocl_cpu, relight, relight_twin
 from gi_core.basis import convert
 from gi_core.constants import BASIS_SIZES
 from gi_core.device import Device, available_devices, choose_device, describe
 from gi_core.errors import DeviceError, InputError, KernelBuildError
+from gi_core.grid import SectorIndex
 from gi_core.layout import DIRECTIONAL_LIGHT
-from gi_core.relight import Relighter
+from gi_core.relight import QUERY_RESIDUAL, Relighter
 from gi_core.relight_input import RelightInput
 from gi_core.resident_sector import ResidentSector
 from gi_core.rooms import outdoor_blend
@@ -159,6 +160,20 @@ def test_convergence_reaches_the_float64_solve(device, make_sector, seed):
     # The contract: within 1e-4 of the peak. The residual asked for is 1e-5.
     assert np.abs(found.cubes - truth).max() <= 1e-4 * np.abs(truth).max()
     assert found.residual <= 1e-5
+
+
+def test_bounces_that_are_given_up_say_so_once_for_a_sector(device, make_sector, monkeypatch, caplog):
+    monkeypatch.setattr(relight, "MAX_PASSES", 5)
+    white = [replace(make_sector(seed, emits=True), index=SectorIndex(seed, -1)) for seed in (9, 10)]
+    white = [replace(sector, surfel_albedo=np.full_like(sector.surfel_albedo, 0.95)) for sector in white]
+    relighter, given = Relighter(device), given_light(9, 1)
+    for sector in (*white, *white):
+        found = relighter.converge(ResidentSector(device, sector, PATCHES), given)
+        left = np.abs(found.cubes - relight_twin.solve(sector, given)).max() / np.abs(found.cubes).max()
+        assert found.passes == 5
+        assert QUERY_RESIDUAL < left <= found.residual
+        assert any(f"{found.residual:.1e} of the brightest" in message for message in caplog.messages)
+    assert [message[:42] for message in caplog.messages] == [f"sector {x},-1: bounces given up after 5 passes"[:42] for x in (9, 10)]
 
 
 def test_feedback_is_a_contraction_at_the_highest_albedo(device, make_sector):
