@@ -1,4 +1,8 @@
-"""A player's irradiance volume in the live world: kept on the device, and filled anew only where light has changed or the player moved."""
+"""A player's irradiance volume in the live world: kept on the device, and filled anew only where light has changed or the player moved.
+
+On the device it lies like a torus along x and z: a voxel's place is its lattice index modulo the volume's size, so that all that a step
+leaves in sight stays where it is, and only columns that come into sight are filled.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -6,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import pyopencl as cl
 
-from gi_core.arrays import AnyArray, Float32, Int64, UInt8
+from gi_core.arrays import Float32, Int64, UInt8
 from gi_core.basis import from_axes
 from gi_core.constants import BASIS_SIZES, VOLUME_SHAPE, VOXEL_NO_SECTOR
 from gi_core.device import Device
@@ -41,12 +45,12 @@ class PublishedVolume:
 class _Layout:
     """What does not change while the volume stays and the same sectors are there.
 
-    boxes : parts that lit sectors fill, with their records; mask : all classes
+    boxes : parts that lit sectors fill; mask : all classes
     placeholders : sectors of the world that are not there, with the columns (z, x) that stand for each
     outside : columns (z, x) without a sector, and for each the column that it copies
     """
 
-    boxes: tuple[tuple[SectorBox, AnyArray], ...]
+    boxes: tuple[SectorBox, ...]
     mask: UInt8
     sectors: tuple[SectorIndex, ...]
     placeholders: tuple[tuple[SectorIndex, slice, slice], ...]
@@ -69,6 +73,8 @@ class LiveVolume:
         self._arrays = arrays or volume_arrays(basis)
         self._buffer = device.allocate(4 * 3 * BASIS_SIZES[basis] * int(np.prod(VOLUME_SHAPE)))
         self._filled_at = -1
+        self._filled_first: Int64 | None = None
+        """Where it stood when it was filled."""
 
     @property
     def nbytes(self) -> int:
@@ -83,21 +89,26 @@ class LiveVolume:
     def enqueue(self, residents: Mapping[SectorIndex, LiveSector], shown: ShownCubes) -> None:
         """Enqueue the filling of what has changed; ``publish`` must follow."""
         present = frozenset(i for i in self.touched if i in residents and residents[i].is_lit)
-        fresh = self._layout is None or present != self._present
-        if fresh:
+        before = self._present
+        if self._layout is None or present != before:
             self._present, self._layout = present, _lay_out(self._first, residents, frozenset(self.touched), present)
-        assert self._layout is not None
-        for box, record in self._layout.boxes:
+        for box in self._layout.boxes:
             sector = residents[box.index]
-            if fresh or sector.shown_at > self._filled_at:
-                sector.resident.fill_volume(record, tuple(int(n) for n in box.size), self._buffer, shown(sector), self.basis)
+            is_new = box.index not in before or sector.shown_at > self._filled_at
+            parts = [box] if is_new else came_into_sight(box, self._first, self._filled_first)
+            cubes = shown(sector) if parts else None
+            for part in parts:
+                record = box_record(part, sector.resident.sector)
+                record["volume_first"][0, [0, 2]] = part.lattice_first[[0, 2]] % (VOLUME_SHAPE[2], VOLUME_SHAPE[1])
+                sector.resident.fill_volume(record, tuple(part.size.tolist()), self._buffer, cubes, self.basis)
+        self._filled_first = self._first
 
     def publish(self, tick: int, placeholder: Callable[[SectorIndex], Float32]) -> PublishedVolume:
         """Read what ``enqueue`` asked for, put placeholders in, and show it."""
         layout = self._layout
         assert layout is not None
         values = self._arrays.take()
-        self._device.read(self._buffer, values)
+        self._read(values)
         for index, z, x in layout.placeholders:
             values[:, :, z, x] = (from_axes(self.basis) @ placeholder(index))[:, None, None, None]
         if layout.outside is not None:
@@ -108,6 +119,49 @@ class LiveVolume:
         missing = tuple(index for index, _, _ in layout.placeholders)
         self.published = PublishedVolume(values, layout.mask, self._first, tick, layout.sectors, missing, self.basis)
         return self.published
+
+    def _read(self, values: Float32) -> None:
+        """Roll the torus out: up to four blocks, whose columns lie beside one another."""
+        ny, nz, nx = VOLUME_SHAPE
+        pitches = (12 * nx, 12 * nx * nz)
+        blocks = [(z, x) for z in _runs(int(self._first[2]), nz) for x in _runs(int(self._first[0]), nx)]
+        for (to_z, from_z, lines), (to_x, from_x, columns) in blocks:
+            cl.enqueue_copy(
+                self._device.queue,
+                values,
+                self._buffer,
+                buffer_origin=(12 * from_x, from_z, 0),
+                host_origin=(12 * to_x, to_z, 0),
+                region=(12 * columns, lines, len(values) * ny),
+                buffer_pitches=pitches,
+                host_pitches=pitches,
+            )
+
+
+def came_into_sight(box: SectorBox, first: Int64, before: Int64 | None) -> list[SectorBox]:
+    """The parts of a box that a volume at ``first`` (3,) [lattice] shows and one at ``before`` did not; along y it is all or nothing."""
+    if before is None or first[1] != before[1]:
+        return [box]
+    size = np.array(VOLUME_SHAPE)[[2, 0, 1]]
+    low, high = box.lattice_first.copy(), box.lattice_first + box.size
+    parts = []
+    for axis in (0, 2):
+        # What lies on one side of where the volume was, then on the other; the rest is cut by the other axis.
+        for side in (slice(low[axis], min(high[axis], before[axis])), slice(max(low[axis], before[axis] + size[axis]), high[axis])):
+            if side.start < side.stop:
+                start, stop = low.copy(), high.copy()
+                start[axis], stop[axis] = side.start, side.stop
+                parts.append(SectorBox(box.index, start - first, start, stop - start))
+        low[axis], high[axis] = max(low[axis], before[axis]), min(high[axis], before[axis] + size[axis])
+        if low[axis] >= high[axis]:
+            break
+    return parts
+
+
+def _runs(first: int, count: int) -> list[tuple[int, int, int]]:
+    """Columns of one axis of a volume at a lattice index: (place in the volume, place in the torus, how many), in two runs at most."""
+    at = first % count
+    return [(0, at, count - at), (count - at, 0, at)] if at else [(0, 0, count)]
 
 
 def volume_arrays(basis: str) -> RecycledArrays:
@@ -127,7 +181,7 @@ def _lay_out(
             sector = residents[box.index].resident.sector
             mask[box_slices(box)] = box_mask(box, sector)
             if sector.probe_count:
-                boxes.append((box, box_record(box, sector)))
+                boxes.append(box)
                 has_light[z, x] = True
         elif box.index in known:
             placeholders.append((box.index, z, x))

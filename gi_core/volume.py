@@ -121,9 +121,14 @@ def sector_slices(box: SectorBox, sector: Sector) -> tuple[AnyArray, slice, slic
 
 def box_mask(box: SectorBox, sector: Sector) -> UInt8:
     """Voxel classes (y, z, x) of a box. Below what a sector stores is solid."""
-    y, z, x = sector_slices(box, sector)
-    mask: UInt8 = np.take(sector.voxel_class[:, z, x], y, axis=0)
-    mask[: max(int(sector.voxel_first[1] - box.lattice_first[1]), 0)] = VOXEL_SOLID
+    mask: UInt8 = np.empty(box.size[[1, 2, 0]], np.uint8)
+    first, layers, height = int(box.lattice_first[1] - sector.voxel_first[1]), len(sector.voxel_class), int(box.size[1])
+    _, z, x = sector_slices(box, sector)
+    # Layers that are stored, what lies below them, and above them the highest again.
+    low, high = min(max(-first, 0), height), min(max(layers - first, 0), height)
+    mask[:low] = VOXEL_SOLID
+    mask[low:high] = sector.voxel_class[first + low : first + high, z, x]
+    mask[max(low, high) :] = sector.voxel_class[-1, z, x]
     return mask
 
 
@@ -142,9 +147,15 @@ def box_slices(box: SectorBox) -> tuple[slice, slice, slice]:
 
 
 def nearest_columns(has_light: Bool) -> tuple[Int64, Int64]:
-    """Columns (n, 2), (z, x), without light, and for each the nearest that has some: a volume has no black edge."""
-    have, lack = np.argwhere(has_light), np.argwhere(~has_light)
-    return lack, have[np.argmin(((lack[:, None] - have[None]) ** 2).sum(axis=2), axis=1)]
+    """Columns (n, 2), (z, x), without light, and for each the nearest that has some, of which there is one at least: a volume has no black
+    edge."""
+    lack, (nz, nx) = np.argwhere(~has_light), has_light.shape
+    # First along z, then, of what that found, along x: squares of distances add.
+    beside_z, beside_x = (np.subtract.outer(np.arange(n), np.arange(n)) ** 2 for n in (nz, nx))
+    near = beside_z[:, :, None] + np.where(has_light, 0, nz * nz + nx * nx)
+    line = near.argmin(axis=1)
+    column = (near.min(axis=1)[:, None] + beside_x).argmin(axis=2)[lack[:, 0], lack[:, 1]]
+    return lack, np.stack([line[lack[:, 0], column], column], axis=1)
 
 
 def sample_volume(values: Float32, origin: Float64, voxel_size: Float64, points: Float64, normals: Float32) -> Float32:

@@ -107,6 +107,20 @@ def test_a_world_that_stands_still_shows_the_very_bytes_of_a_query(world, engine
     np.testing.assert_array_equal(world.volumes.of_player["p0"].published.mask, query.mask)
 
 
+def test_a_volume_that_moved_shows_the_very_bytes_of_one_that_always_stood_there(world, engine):
+    run, lighting, rng = Run(world), engine.lighting("12:00", "clear"), np.random.default_rng(5)
+    light = light_of(world, lighting)
+    run.settle(at(STREET), light)
+    place = STREET
+    for _ in range(40):
+        # Steps along one axis and two, up and down, and jumps to where nothing of the last place is in sight.
+        place = STREET + rng.normal(0, 30, 3) if rng.random() < 0.2 else place + rng.integers(-2, 3, 3) * (3.125, rng.random() < 0.3, 3.125)
+        run.tick(at(place), light)
+        query, shown = engine.volume(place, lighting), world.published("p0")
+        np.testing.assert_array_equal(shown.values, query.values)
+        np.testing.assert_array_equal(shown.mask, query.mask)
+
+
 @pytest.mark.parametrize("basis", ["cube", "sh1", "sh2"])
 @pytest.mark.parametrize("settings", [NEUTRAL, Settings(bounce_factor=2.0, ambient_up=(10.0, 20.0, 30.0))], ids=["neutral", "gains"])
 def test_volumes_in_each_basis_are_the_very_bytes_of_a_query(basis, settings):
