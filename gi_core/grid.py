@@ -4,6 +4,7 @@ A voxel of the world lattice with index (x, y, z) has its centre at ((x, y, z) +
 holds its centre. 64 m is 20.48 voxels, so a sector owns 20 or 21 voxel columns along each side; no centre ever lies on a border.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -36,7 +37,7 @@ def voxel_columns(sector_coordinate: int, voxel_size_m: float = VOXEL_SIZE_M) ->
     """First and past-the-last voxel index along x (or z) of the columns whose centres lie in a sector."""
 
     def first(edge_m: float) -> int:
-        return int(np.ceil(edge_m / voxel_size_m - 0.5))
+        return math.ceil(edge_m / voxel_size_m - 0.5)
 
     return first(sector_coordinate * SECTOR_SIZE_M), first((sector_coordinate + 1) * SECTOR_SIZE_M)
 

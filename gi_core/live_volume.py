@@ -45,14 +45,16 @@ class PublishedVolume:
 class _Layout:
     """What does not change while the volume stays and the same sectors are there.
 
-    boxes : parts that lit sectors fill; mask : all classes
+    first : (3,) where it stands; present : sectors that are there, and lit
+    boxes : parts that they fill; mask : all classes
     placeholders : sectors of the world that are not there, with the columns (z, x) that stand for each
     outside : columns (z, x) without a sector, and for each the column that it copies
     """
 
+    first: Int64
+    present: frozenset[SectorIndex]
     boxes: tuple[SectorBox, ...]
     mask: UInt8
-    sectors: tuple[SectorIndex, ...]
     placeholders: tuple[tuple[SectorIndex, slice, slice], ...]
     outside: tuple[Int64, Int64] | None
 
@@ -69,12 +71,10 @@ class LiveVolume:
         self._device = device
         self._first: Int64 = np.zeros(3, np.int64)
         self._layout: _Layout | None = None
-        self._present: frozenset[SectorIndex] = frozenset()
+        """Of the last filling."""
         self._arrays = arrays or volume_arrays(basis)
         self._buffer = device.allocate(4 * 3 * BASIS_SIZES[basis] * int(np.prod(VOLUME_SHAPE)))
         self._filled_at = -1
-        self._filled_first: Int64 | None = None
-        """Where it stood when it was filled."""
 
     @property
     def nbytes(self) -> int:
@@ -83,25 +83,24 @@ class LiveVolume:
 
     def move(self, first_voxel: Int64, known: frozenset[SectorIndex]) -> None:
         """Stand elsewhere: the lattice index (3,) of voxel (0, 0, 0). ``known``: sectors of the world."""
-        self._first, self._layout = first_voxel, None
+        self._first = first_voxel
         self.touched = tuple(box.index for box in plan_boxes(first_voxel) if box.index in known)
 
     def enqueue(self, residents: Mapping[SectorIndex, LiveSector], shown: ShownCubes) -> None:
         """Enqueue the filling of what has changed; ``publish`` must follow."""
         present = frozenset(i for i in self.touched if i in residents and residents[i].is_lit)
-        before = self._present
-        if self._layout is None or present != before:
-            self._present, self._layout = present, _lay_out(self._first, residents, frozenset(self.touched), present)
+        before = self._layout
+        if before is None or present != before.present or self._first is not before.first:
+            self._layout = _lay_out(self._first, residents, frozenset(self.touched), present, before)
+        assert self._layout is not None
         for box in self._layout.boxes:
             sector = residents[box.index]
-            is_new = box.index not in before or sector.shown_at > self._filled_at
-            parts = [box] if is_new else came_into_sight(box, self._first, self._filled_first)
+            parts = [box] if sector.shown_at > self._filled_at else _new_parts(box, self._first, before)
             cubes = shown(sector) if parts else None
             for part in parts:
                 record = box_record(part, sector.resident.sector)
                 record["volume_first"][0, [0, 2]] = part.lattice_first[[0, 2]] % (VOLUME_SHAPE[2], VOLUME_SHAPE[1])
                 sector.resident.fill_volume(record, tuple(part.size.tolist()), self._buffer, cubes, self.basis)
-        self._filled_first = self._first
 
     def publish(self, tick: int, placeholder: Callable[[SectorIndex], Float32]) -> PublishedVolume:
         """Read what ``enqueue`` asked for, put placeholders in, and show it."""
@@ -117,14 +116,16 @@ class LiveVolume:
         values.setflags(write=False)
         self._filled_at = tick
         missing = tuple(index for index, _, _ in layout.placeholders)
-        self.published = PublishedVolume(values, layout.mask, self._first, tick, layout.sectors, missing, self.basis)
+        self.published = PublishedVolume(values, layout.mask, layout.first, tick, tuple(sorted(layout.present)), missing, self.basis)
         return self.published
 
     def _read(self, values: Float32) -> None:
         """Roll the torus out: up to four blocks, whose columns lie beside one another."""
         ny, nz, nx = VOLUME_SHAPE
         pitches = (12 * nx, 12 * nx * nz)
-        blocks = [(z, x) for z in _runs(int(self._first[2]), nz) for x in _runs(int(self._first[0]), nx)]
+        assert self._layout is not None
+        first_x, _, first_z = self._layout.first.tolist()
+        blocks = [(z, x) for z in _runs(first_z, nz) for x in _runs(first_x, nx)]
         for (to_z, from_z, lines), (to_x, from_x, columns) in blocks:
             cl.enqueue_copy(
                 self._device.queue,
@@ -138,24 +139,32 @@ class LiveVolume:
             )
 
 
-def came_into_sight(box: SectorBox, first: Int64, before: Int64 | None) -> list[SectorBox]:
+def came_into_sight(box: SectorBox, first: Int64, before: Int64) -> list[SectorBox]:
     """The parts of a box that a volume at ``first`` (3,) [lattice] shows and one at ``before`` did not; along y it is all or nothing."""
-    if before is None or first[1] != before[1]:
+    here, there, low, size = first.tolist(), before.tolist(), box.lattice_first.tolist(), box.size.tolist()
+    if here == there:
+        return []
+    if here[1] != there[1]:
         return [box]
-    size = np.array(VOLUME_SHAPE)[[2, 0, 1]]
-    low, high = box.lattice_first.copy(), box.lattice_first + box.size
+    high = [at + count for at, count in zip(low, size, strict=True)]
     parts = []
-    for axis in (0, 2):
-        # What lies on one side of where the volume was, then on the other; the rest is cut by the other axis.
-        for side in (slice(low[axis], min(high[axis], before[axis])), slice(max(low[axis], before[axis] + size[axis]), high[axis])):
-            if side.start < side.stop:
-                start, stop = low.copy(), high.copy()
-                start[axis], stop[axis] = side.start, side.stop
-                parts.append(SectorBox(box.index, start - first, start, stop - start))
-        low[axis], high[axis] = max(low[axis], before[axis]), min(high[axis], before[axis] + size[axis])
+    for axis, count in ((0, VOLUME_SHAPE[2]), (2, VOLUME_SHAPE[1])):
+        # What lies on one side of where the volume was, then on the other; the other axis cuts what is left.
+        seen = max(low[axis], there[axis]), min(high[axis], there[axis] + count)
+        for start, stop in ((low[axis], min(high[axis], there[axis])), (max(low[axis], there[axis] + count), high[axis])):
+            if start < stop:
+                corner, extent = low.copy(), [b - a for a, b in zip(low, high, strict=True)]
+                corner[axis], extent[axis] = start, stop - start
+                parts.append(SectorBox(box.index, np.array(corner) - first, np.array(corner), np.array(extent)))
+        low[axis], high[axis] = seen
         if low[axis] >= high[axis]:
             break
     return parts
+
+
+def _new_parts(box: SectorBox, first: Int64, before: _Layout | None) -> list[SectorBox]:
+    """The parts of a lit sector's box that a layout did not have."""
+    return [box] if before is None or box.index not in before.present else came_into_sight(box, first, before.first)
 
 
 def _runs(first: int, count: int) -> list[tuple[int, int, int]]:
@@ -170,22 +179,41 @@ def volume_arrays(basis: str) -> RecycledArrays:
 
 
 def _lay_out(
-    first: Int64, residents: Mapping[SectorIndex, LiveSector], known: frozenset[SectorIndex], present: frozenset[SectorIndex]
+    first: Int64,
+    residents: Mapping[SectorIndex, LiveSector],
+    known: frozenset[SectorIndex],
+    present: frozenset[SectorIndex],
+    before: _Layout | None,
 ) -> _Layout:
+    """``before`` : of the same volume, whose classes of the same sectors are taken over."""
     mask = np.full(VOLUME_SHAPE, VOXEL_NO_SECTOR, np.uint8)
     has_light = np.zeros(VOLUME_SHAPE[1:], bool)
+    if before is not None:
+        _copy_moved(before.mask, mask, first - before.first)
     boxes, placeholders = [], []
     for box in plan_boxes(first):
-        _, z, x = box_slices(box)
+        slices = box_slices(box)
         if box.index in present:
             sector = residents[box.index].resident.sector
-            mask[box_slices(box)] = box_mask(box, sector)
+            for part in _new_parts(box, first, before):
+                mask[box_slices(part)] = box_mask(part, sector)
             if sector.probe_count:
                 boxes.append(box)
-                has_light[z, x] = True
-        elif box.index in known:
-            placeholders.append((box.index, z, x))
-            has_light[z, x] = True
+                has_light[slices[1:]] = True
+        else:
+            mask[slices] = VOXEL_NO_SECTOR
+            if box.index in known:
+                placeholders.append((box.index, *slices[1:]))
+                has_light[slices[1:]] = True
     mask.setflags(write=False)
     outside = None if has_light.all() or not has_light.any() else nearest_columns(has_light)
-    return _Layout(tuple(boxes), mask, tuple(sorted(present)), tuple(placeholders), outside)
+    return _Layout(first, present, tuple(boxes), mask, tuple(placeholders), outside)
+
+
+def _copy_moved(source: UInt8, target: UInt8, step: Int64) -> None:
+    """What two volumes (y, z, x) both show, where the second stands a step (x, y, z) from the first."""
+    pairs = [
+        (slice(max(by, 0), count + min(by, 0)), slice(max(-by, 0), count - max(by, 0)))
+        for by, count in zip(step[[1, 2, 0]].tolist(), source.shape, strict=True)
+    ]
+    target[tuple(to for _, to in pairs)] = source[tuple(of for of, _ in pairs)]

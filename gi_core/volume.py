@@ -1,6 +1,7 @@
 """The irradiance volume around a position: 100 x 50 x 100 m in 32 x 16 x 32 voxels (slide "Irradiance volume"), and how a client
 samples it."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -85,7 +86,7 @@ def plan_boxes(first_voxel: Int64, voxel_size_m: float = VOXEL_SIZE_M) -> list[S
 def split_columns(first: int, count: int, voxel_size_m: float) -> list[tuple[int, int, int]]:
     """Runs (sector, first voxel, past the last) of voxel columns along one axis."""
     runs = []
-    sector = int(np.floor(voxel_centre(np.array([first]), voxel_size_m)[0] / SECTOR_SIZE_M))
+    sector = math.floor((first + 0.5) * voxel_size_m / SECTOR_SIZE_M)
     at = first
     while at < first + count:
         end = min(voxel_columns(sector, voxel_size_m)[1], first + count)
@@ -149,13 +150,19 @@ def box_slices(box: SectorBox) -> tuple[slice, slice, slice]:
 def nearest_columns(has_light: Bool) -> tuple[Int64, Int64]:
     """Columns (n, 2), (z, x), without light, and for each the nearest that has some, of which there is one at least: a volume has no black
     edge."""
+    # First along z, then, of what that found, along x: squares of distances add. Each carries its column, so that the least tells which.
     lack, (nz, nx) = np.argwhere(~has_light), has_light.shape
-    # First along z, then, of what that found, along x: squares of distances add.
-    beside_z, beside_x = (np.subtract.outer(np.arange(n), np.arange(n)) ** 2 for n in (nz, nx))
-    near = beside_z[:, :, None] + np.where(has_light, 0, nz * nz + nx * nx)
-    line = near.argmin(axis=1)
-    column = (near.min(axis=1)[:, None] + beside_x).argmin(axis=2)[lack[:, 0], lack[:, 1]]
-    return lack, np.stack([line[lack[:, 0], column], column], axis=1)
+    square, line = np.divmod(_least_beside(np.where(has_light, np.int32(0), np.int32(nz * nz + nx * nx))), nz)
+    column = _least_beside(square.T).T % nx
+    z, x = lack.T
+    return lack, np.stack([line[z, column[z, x]], column[z, x]], axis=1).astype(np.int64)
+
+
+def _least_beside(square: Int32) -> Int32:
+    """(n, m) for (n, m): along the first axis the least of square + distance^2, times n, plus where that was."""
+    place = np.arange(len(square), dtype=np.int32)
+    beside = np.subtract.outer(place, place) ** 2 * np.int32(len(square)) + place[:, None]
+    return np.asarray((beside[:, :, None] + square[:, None] * np.int32(len(square))).min(axis=0), np.int32)
 
 
 def sample_volume(values: Float32, origin: Float64, voxel_size: Float64, points: Float64, normals: Float32) -> Float32:
