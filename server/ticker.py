@@ -2,8 +2,8 @@
 
 Tick n is due at start + n / rate, whatever the ticks before took: nothing drifts. A tick that is late begins at once; one whose
 successor is already due is skipped, and its number with it, so that the world's clock stays true to real time. What is left out under
-load, in this order: details for /v1/live, which are made when asked for; volumes, which wait for later ticks, those that waited longest
-first. Streaming and relighting are never left out.
+load, in this order: details for /v1/live, which are made when asked for; volumes, which wait for later ticks, those first whose light has
+changed far from their players (gi_core.fill_plan). Streaming and relighting are never left out.
 """
 
 import gc

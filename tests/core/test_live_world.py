@@ -4,7 +4,9 @@ import shutil
 import time
 from dataclasses import replace
 from datetime import datetime
+from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -306,6 +308,37 @@ def test_the_budget_holds_while_a_player_walks_to_and_fro(engine):
         assert np.isfinite(world.volumes.of_player["p0"].published.values).all()
     finally:
         world.close()
+
+
+def far_from_the_change(world, engine) -> tuple[TickPlayers, LiveLight]:
+    """A settled world of eight players whose volumes read both sectors: the even ones stand in the eastern one, the odd in the western."""
+    players, light = at(*[STREET - EAST * (k % 2 * 10 + k) for k in range(4)] * 2), light_of(world, engine.lighting("12:00", "clear"))
+    assert [int(x < 0) for x in players.positions[:, 0]] == [0, 1] * 4
+    Run(world).settle(players, light)
+    return players, light
+
+
+def test_whose_own_sector_was_relit_is_served_first_and_nobody_is_forgotten(world, engine):
+    players, light = far_from_the_change(world, engine)
+    order = []
+    for tick in range(1000, 1000 + len(players.ids)):
+        world.volumes.note(tick, players.ids, players.positions, [SectorIndex(-1, 0)] if tick == 1000 else [])
+        filled, waiting = world.volumes.fill(tick, -np.inf, lambda sector: world._shown(sector, light), world._placeholder)
+        assert len(filled) == 1
+        order += filled
+        assert waiting == len(players.ids) - len(order)
+    assert sorted(order) == sorted(players.ids)
+    assert set(order[:4]) == {"p1", "p3", "p5", "p7"}
+
+
+def test_no_volume_is_begun_when_the_ticks_time_for_them_is_over(world, engine, monkeypatch):
+    players, light = far_from_the_change(world, engine)
+    looks = count(1)
+    monkeypatch.setattr("gi_core.live_volumes.time", SimpleNamespace(perf_counter=lambda: float(next(looks))))
+    world.volumes.note(1000, players.ids, players.positions, [SectorIndex(0, 0)])
+    # A second passes with each look at the clock: the first volume needs none, one begins at 1 s, another at 2 s, none at 3 s.
+    filled, waiting = world.volumes.fill(1000, 3.0, lambda sector: world._shown(sector, light), world._placeholder)
+    assert (len(filled), waiting) == (3, 5)
 
 
 def test_players_share_sectors_and_leave_nothing_behind(world, engine):
