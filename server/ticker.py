@@ -106,6 +106,11 @@ class Ticker:
         return done
 
     def _run(self) -> None:
+        if self._get_ready():
+            self._beat()
+
+    def _get_ready(self) -> bool:
+        """Whether the world can be run."""
         try:
             started = time.perf_counter()
             self.world.warm_up()
@@ -120,7 +125,11 @@ class Ticker:
             self._stop.set()
             self._refuse_commands()
             self._running.set()
-            return
+            return False
+        return True
+
+    def _beat(self) -> None:
+        """Ticks, until the ticker is stopped."""
         period_s = 1 / self.rate_hz
         start = time.perf_counter()
         while not self._stop.is_set():

@@ -341,6 +341,14 @@ def test_no_volume_is_begun_when_the_ticks_time_for_them_is_over(world, engine, 
     assert (len(filled), waiting) == (3, 5)
 
 
+def test_without_any_time_left_two_sectors_are_relit_all_the_same(world, engine):
+    players, _ = far_from_the_change(world, engine)
+    afternoon = light_of(world, engine.lighting("16:00", "clear"), standing=False)
+    report = world.tick(1000, players, afternoon, fill_ms=-np.inf)
+    assert set(report.relit) == {SectorIndex(0, 0), SectorIndex(-1, 0)}
+    assert (len(report.filled), report.waiting) == (1, len(players.ids) - 1)
+
+
 def test_players_share_sectors_and_leave_nothing_behind(world, engine):
     run, light = Run(world), light_of(world, engine.lighting("12:00", "clear"))
     run.settle(at(STREET, STREET + EAST * 3.2, STREET), light)
