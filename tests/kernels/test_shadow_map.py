@@ -61,6 +61,21 @@ def test_the_map_equals_its_twin(device, elevation):
     assert (expected > shadow_map_twin.NOTHING_DRAWN).mean() > 0.05
 
 
+@pytest.mark.parametrize("elevation", [90.0, 30.0, 6.0])
+def test_triangles_seen_edge_on_shade_nothing_above_them(device, elevation):
+    """Walls along the sun's rays: rounding makes up their slope, and what lies behind would be shaded by hundreds of metres of it."""
+    rng, to_sun, count = np.random.default_rng(0), towards(elevation), 3000
+    a, b = rng.uniform(-60, 120, (2, count, 3))
+    aside = rng.normal(size=(count, 3)) * 10 ** rng.uniform(-7, -2, (count, 1))
+    c = a + rng.uniform(-0.5, 1.5, (count, 1)) * (b - a) + rng.uniform(-40, 40, (count, 1)) * to_sun + aside
+    corners = np.stack([a, b, c], axis=1)
+    shadow_map = drawn(device, corners, to_sun)
+    highest = shadow_map_twin.map_from_world(shadow_map.plan, corners)[..., 2].max()
+    found = shadow_map.read()
+    assert (found > shadow_map_twin.NOTHING_DRAWN).any()
+    assert found.max() <= highest + 1e-3  # float32 knows some hundred metres to 3e-5 m
+
+
 def samples_of(device, make_sector, seed: int, **changes) -> SunSamples:
     sector = make_sector(seed, surfels=2000)
     rng = np.random.default_rng(seed)
