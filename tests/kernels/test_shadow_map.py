@@ -215,3 +215,22 @@ def test_an_unchanged_sun_gives_the_same_texels_wherever_the_player_stands(devic
     close = np.abs(a - moved)[inner, inner] < 5e-3
     both = (a[inner, inner] > -1e29) & (moved[inner, inner] > -1e29)
     assert close[both].mean() > 0.999
+
+
+def test_seventy_kilometres_from_the_origin_samples_are_the_same(device, make_sector):
+    shift = np.array([775 * 64.0, 0.0, -775 * 64.0])
+    near = samples_of(device, make_sector, 5)
+    far = SunSamples(device, ResidentSector(device, replace(near.resident.sector, index=SectorIndex(775, -775)), 6))
+    corners = random_city(3)
+    found = []
+    for samples, at in ((near, np.zeros(3)), (far, shift)):
+        index = samples.resident.sector.index
+        # A sector's triangles are local to it; the sun stands so that the shift is of whole texels.
+        shadow_map = ShadowMap(device, lambda _: triangle_records(corners), TOP)
+        shadow_map.begin(plan_map(MIDDLE + at, towards(90.0), {index}, 0.0, TOP))
+        assert shadow_map.draw(1)
+        shadow_map.sample(samples)
+        found.append(samples.read())
+    np.testing.assert_array_equal(found[1][0], found[0][0])
+    np.testing.assert_array_equal(found[1][1], found[0][1])
+    assert 0.02 < (found[0][0] == WHOLE_SAMPLE).mean() < 0.9
