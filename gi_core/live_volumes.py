@@ -4,20 +4,32 @@ Found by what has changed, not by looking at everybody: a player who moved to ot
 players whose volumes read it. A thousand players who stand in settled light cost nothing.
 """
 
+import math
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
 
 from gi_core.arrays import Float32, Float64
+from gi_core.constants import SECTOR_SIZE_M
 from gi_core.device import Device
+from gi_core.fill_plan import fill_order
 from gi_core.grid import SectorIndex, volume_first_voxel
 from gi_core.live_sector import LiveSector
 from gi_core.live_volume import LiveVolume, ShownCubes, volume_arrays
 
 # A new player's first volume is held back until all of its sectors are lit, but not for longer than two seconds at 30 Hz.
 HELD_TICKS = 60
-# Volumes whose filling is enqueued before the first of them is read.
-FILLED_TOGETHER = 4
+
+
+@dataclass(slots=True)
+class _Behind:
+    """A volume that has to be filled: since which tick, and how far from its player the nearest change is [m]."""
+
+    since: int
+    away_m: float
 
 
 class LiveVolumes:
@@ -32,7 +44,7 @@ class LiveVolumes:
         self._arrays = volume_arrays(basis)
         self._firsts: dict[str, bytes] = {}
         self._readers: dict[SectorIndex, set[str]] = {}
-        self._stale: dict[str, int] = {}
+        self._behind: dict[str, _Behind] = {}
 
     @property
     def nbytes(self) -> int:
@@ -48,7 +60,7 @@ class LiveVolumes:
         """Find what has to be filled: for players ``ids`` (p) at positions (p, 3) [m], and sectors that show something else now."""
         for gone in self.of_player.keys() - set(ids):
             self._unread(gone, self.of_player.pop(gone))
-            self._stale.pop(gone, None)
+            self._behind.pop(gone, None)
             del self._firsts[gone]
         firsts = volume_first_voxel(positions)
         for row, name in enumerate(ids):
@@ -64,36 +76,39 @@ class LiveVolumes:
                     self._readers.setdefault(index, set()).add(name)
                 if volume.published is not None:
                     self.looked_at.update(volume.touched)
-                self._stale.setdefault(name, tick)
+                self._fall_behind(name, tick, 0.0)
+        places = dict(zip(ids, positions[:, [0, 2]].tolist(), strict=True))
         for index in changed:
             for name in self._readers.get(index, ()):
-                self._stale.setdefault(name, tick)
+                self._fall_behind(name, tick, _away_m(index, *places[name]))
 
     def fill(
         self, tick: int, until_s: float, shown: ShownCubes, placeholder: Callable[[SectorIndex], Float32]
     ) -> tuple[tuple[str, ...], int]:
-        """Fill and publish volumes, those that waited longest first, at least some, until ``time.perf_counter`` says ``until_s``.
+        """Fill and publish volumes in the order of ``fill_plan``, at least one, until ``time.perf_counter`` says ``until_s``.
 
         -> whose, and how many wait for another tick
         """
+        ready = [name for name in sorted(self._behind) if not self._is_held(name, tick)]
+        behind = [self._behind[name] for name in ready]
+        order = fill_order(tick, np.array([b.since for b in behind], np.int64), np.array([b.away_m for b in behind], np.float64))
         filled: list[str] = []
-        held = 0
-        waiting = sorted(self._stale, key=lambda name: (self._stale[name], name))
-        while waiting and (not filled or time.perf_counter() < until_s):
-            # The device fills some while this thread prepares the next and reads those before.
-            group, waiting = waiting[:FILLED_TOGETHER], waiting[FILLED_TOGETHER:]
-            ready = [name for name in group if not self._is_held(name, tick)]
-            held += len(group) - len(ready)
-            for name in ready:
-                self.of_player[name].enqueue(self._residents, shown)
-            for name in ready:
-                volume = self.of_player[name]
-                if volume.published is None:
-                    self.looked_at.update(volume.touched)
-                volume.publish(tick, placeholder)
-                del self._stale[name]
-            filled += ready
-        return tuple(filled), len(self._stale) - held
+        for row in order.tolist():
+            if filled and time.perf_counter() >= until_s:
+                break
+            name = ready[row]
+            volume = self.of_player[name]
+            volume.enqueue(self._residents, shown)
+            if volume.published is None:
+                self.looked_at.update(volume.touched)
+            volume.publish(tick, placeholder)
+            del self._behind[name]
+            filled.append(name)
+        return tuple(filled), len(ready) - len(filled)
+
+    def _fall_behind(self, name: str, tick: int, away_m: float) -> None:
+        behind = self._behind.setdefault(name, _Behind(tick, away_m))
+        behind.away_m = min(behind.away_m, away_m)
 
     def _unread(self, name: str, volume: LiveVolume) -> None:
         """A player's volume no longer reads what it read."""
@@ -109,4 +124,10 @@ class LiveVolumes:
     def _is_held(self, name: str, tick: int) -> bool:
         """Whether a new player's first volume waits for sectors that are on their way."""
         volume = self.of_player[name]
-        return volume.published is None and tick < self._stale[name] + HELD_TICKS and not all(map(self._is_lit, volume.touched))
+        return volume.published is None and tick < self._behind[name].since + HELD_TICKS and not all(map(self._is_lit, volume.touched))
+
+
+def _away_m(index: SectorIndex, x: float, z: float) -> float:
+    """From (x, z) [m], world frame, to the nearest point of a sector; 0 in it."""
+    low_x, low_z = index.x * SECTOR_SIZE_M, index.z * SECTOR_SIZE_M
+    return math.hypot(max(low_x - x, 0.0, x - low_x - SECTOR_SIZE_M), max(low_z - z, 0.0, z - low_z - SECTOR_SIZE_M))

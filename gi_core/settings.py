@@ -14,6 +14,7 @@ from gi_core.basis import basis_of_size, from_axes
 from gi_core.constants import ROOM_OUTDOORS
 from gi_core.errors import InputError
 from gi_core.lighting import DirectionalLight, Lighting
+from gi_core.lights import MAX_LUMENS
 from gi_core.world import Lamp
 
 # Beyond this a picture is white whatever the scene; float32 holds noon times this with room to spare.
@@ -73,10 +74,11 @@ class Settings:
         return replace(lighting, sun=dimmed(lighting.sun), moon=dimmed(lighting.moon), sky_radiance=sky, sky_cube=cube)
 
     def brightened(self, lamps: tuple[Lamp, ...]) -> tuple[Lamp, ...]:
-        """Lamps with their gain applied; those that give nothing are left out."""
+        """Lamps with their gain applied, up to the most that a lamp may give; those that give nothing are left out."""
         if self.lights_factor == 1.0:
             return lamps
-        return tuple(replace(lamp, lumens=lamp.lumens * self.lights_factor) for lamp in lamps if self.lights_factor > 0)
+        gain = self.lights_factor
+        return tuple(replace(lamp, lumens=min(lamp.lumens * gain, MAX_LUMENS)) for lamp in lamps if gain > 0)
 
     @property
     def has_ambient(self) -> bool:

@@ -54,8 +54,8 @@ def sample(plan: ShadowPlan, depth: Float32, position: AnyArray, normal: Float32
     bias = SHADOW_BIAS_M + SHADOW_BIAS_CELLS * size
     middle = map_from_world(plan, position + bias[:, None] * normal)
     spread = size / 2 * TEXELS_PER_METRE
-    # The cell seen from the sun is shortened along the direction in which it is slanted.
-    shorten = spread / (1 + cosine)
+    # The cell seen from the sun is shortened along the direction in which it is slanted; what faces away is not looked up.
+    shorten = spread / (1 + np.maximum(cosine, 0))
     lit: AnyArray = np.zeros(len(position), np.int32)
     for a, b in TAPS.astype(position.dtype):
         aside = spread * a - (a * across + b * down) * across * shorten

@@ -41,6 +41,8 @@ __kernel void draw_shadow_map(
         if (!(area > EDGE_ON || area < -EDGE_ON))
             continue;
         const float depth_by_column = (u.z * v.y - v.z * u.y) / area, depth_by_row = (v.z * u.x - u.z * v.x) / area;
+        // A triangle seen nearly edge on has slopes that rounding makes up: above its highest corner they would shade what it does not.
+        const float highest = p0.z > p1.z ? (p0.z > p2.z ? p0.z : p2.z) : (p1.z > p2.z ? p1.z : p2.z);
         const float from = low - 0.5f > 0.0f ? low - 0.5f : 0.0f, until = high - 0.5f < size - 1 ? high - 0.5f : size - 1;
         const int row_of_low = (int)from + ((int)from < from), row_of_high = (int)until;
         const int before_own = (row_of_low - own + rows_apart - 1) / rows_apart;
@@ -65,7 +67,7 @@ __kernel void draw_shadow_map(
             for (int column = (int)left + ((int)left < left); column <= (int)right; column += 8) {
                 __global loose_float8 *texels = (__global loose_float8 *)(line + column);
                 const float8 at = (float)column + (float8)(0, 1, 2, 3, 4, 5, 6, 7), before = *texels;
-                const float8 depth = depth_at_zero + depth_by_column * at;
+                const float8 plane = depth_at_zero + depth_by_column * at, depth = plane > highest ? (float8)(highest) : plane;
                 *texels = at <= right && depth > before ? depth : before;
             }
         }

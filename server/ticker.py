@@ -2,8 +2,8 @@
 
 Tick n is due at start + n / rate, whatever the ticks before took: nothing drifts. A tick that is late begins at once; one whose
 successor is already due is skipped, and its number with it, so that the world's clock stays true to real time. What is left out under
-load, in this order: details for /v1/live, which are made when asked for; volumes, which wait for later ticks, those that waited longest
-first. Streaming and relighting are never left out.
+load, in this order: details for /v1/live, which are made when asked for; volumes, which wait for later ticks, those first whose light has
+changed far from their players (gi_core.fill_plan). Streaming and relighting are never left out.
 """
 
 import gc
@@ -106,6 +106,11 @@ class Ticker:
         return done
 
     def _run(self) -> None:
+        if self._get_ready():
+            self._beat()
+
+    def _get_ready(self) -> bool:
+        """Whether the world can be run."""
         try:
             started = time.perf_counter()
             self.world.warm_up()
@@ -120,7 +125,11 @@ class Ticker:
             self._stop.set()
             self._refuse_commands()
             self._running.set()
-            return
+            return False
+        return True
+
+    def _beat(self) -> None:
+        """Ticks, until the ticker is stopped."""
         period_s = 1 / self.rate_hz
         start = time.perf_counter()
         while not self._stop.is_set():

@@ -16,6 +16,8 @@ BRIGHTENING = 2.0
 
 # A reflected-light meter reads L = 12.5 / 100 * 2^EV100 (ISO 2720).
 METER_PER_EV = 0.125
+# Times white: the curve is flat from here on, and its squares would only lose precision.
+FLAT_BEYOND = 1e4
 
 
 def metered(radiance: Float32, ev100: float) -> float:
@@ -29,13 +31,15 @@ def metered(radiance: Float32, ev100: float) -> float:
 
 
 def exposed(radiance: Float32, ev100: float) -> Float32:
-    """Radiance [cd m^-2] relative to white, one stop brighter than the meter's."""
-    return np.asarray(radiance * np.float32(BRIGHTENING / (WHITE_PER_EV * 2.0**ev100)), np.float32)
+    """Radiance [cd m^-2] relative to white, one stop brighter than the meter's; as far as FLAT_BEYOND."""
+    gain = BRIGHTENING / (WHITE_PER_EV * 2.0**ev100)
+    most = min(FLAT_BEYOND / gain, float(np.finfo(np.float32).max))  # float32 has no room for all of it under a black sky
+    return np.asarray(np.minimum(radiance, np.float32(most)) * np.float32(gain), np.float32)
 
 
 def filmic(linear: Float32) -> Float32:
     """0..inf -> 0..1 with a shoulder and a toe: Narkowicz's fit of the ACES curve (2015), per channel."""
-    x = np.minimum(np.maximum(linear, 0), 1e4)  # beyond this the curve is flat and its squares would only lose precision
+    x = np.minimum(np.maximum(linear, 0), FLAT_BEYOND)
     return np.asarray(np.clip(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0, 1), np.float32)
 
 

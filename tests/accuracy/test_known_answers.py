@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+import trimesh
 
 from bake_jobs.config import BakeSettings, settings_for
 from gi_core import relight_twin, sector_file
@@ -11,13 +12,18 @@ from gi_core.ambient_cube import project_radiance
 from gi_core.basis import FEEDBACK, conversion
 from gi_core.constants import ALBEDO_MAX, SKY_SHAPE, VOXEL_INDOORS, VOXEL_SOLID
 from gi_core.device import shared_device
+from gi_core.geometry_file import Geometry
+from gi_core.grid import SectorIndex
+from gi_core.light_geometry import ShadowGeometry
+from gi_core.light_surfels import SurfelLights
 from gi_core.lighting import DirectionalLight, Lighting
 from gi_core.relight import Relighter
 from gi_core.relight_input import RelightInput, relight_input
 from gi_core.resident_sector import ResidentSector
 from gi_core.sector import Sector
+from gi_core.spectrum import LUMINANCE_FROM_RGB
 from gi_core.sun_table import SunTable
-from gi_core.world import Location, Room
+from gi_core.world import Lamp, Location, Room
 
 TABLE = SunTable.build(Location(), 23.44, 30.0)  # few planes: these tests ask when the sun shines, not how sharp its shadows are
 NO_LIGHT = DirectionalLight(np.array([0.0, 1.0, 0.0]), np.zeros(3))
@@ -25,6 +31,10 @@ UP, DOWN = 2, 3
 SIDES = [0, 1, 4, 5]
 # The issue's bar for scenes with an exact answer.
 ONE_PERCENT = 0.01
+HERE = SectorIndex(0, 0)
+# Its range is so long that the window at its end takes nothing.
+LAMP = Lamp("lamp", "point", (32.0, 16.0, 32.0), 1000.0, (1.0, 0.7, 0.4), 1000.0)
+LAMP_FLUX = LAMP.lumens * np.array(LAMP.color) / (LUMINANCE_FROM_RGB @ np.array(LAMP.color))
 
 
 def uniform_sky(radiance=0.0, sun=NO_LIGHT, moon=NO_LIGHT, snow=0.0) -> Lighting:
@@ -56,6 +66,13 @@ class Lit:
 
     def light(self, lighting: Lighting):
         return self.relighter.converge(self.resident, self.given(lighting)).cubes
+
+    def hang(self, scene, *lamps: Lamp) -> None:
+        """Light lamps, shadowed by the scene; until they are hung anew."""
+        geometry = Geometry(scene.vertices, scene.triangles, scene.albedo, scene.emission)
+        self.lamps = SurfelLights(self.resident.device, self.sector, ShadowGeometry({HERE: geometry}.__getitem__, [HERE]))
+        self.lamps.set_static(lamps)
+        self.resident.set_lamps(self.lamps.buffer)
 
     def cubes(self, lighting: Lighting):
         """What the basis says of the six faces: (P, 6, 3) [lx]."""
@@ -103,6 +120,41 @@ def test_a_closed_white_furnace_converges_to_emission_over_one_minus_albedo(buil
     # And at the voxels, which blend probes that are all alike.
     voxels = relight_twin.blend_voxels(lit.sector, lit.cubes(uniform_sky(5000.0)))[lit.sector.voxel_class == VOXEL_INDOORS]
     np.testing.assert_allclose(voxels, np.broadcast_to(expected, voxels.shape), rtol=ONE_PERCENT)
+
+
+@in_all_modes
+@pytest.mark.parametrize("albedo", [0.0, 0.3, 0.8])
+def test_a_lamp_amid_a_hollow_ball_gives_its_flux_over_the_area_as_often_as_light_returns(build, light, albedo, mode):
+    """An integrating sphere: what walls reflect is as bright everywhere and in all directions, rho / (1 - rho) times what they get."""
+    radius, middle = 8.0, np.array(LAMP.position)
+    ball = trimesh.creation.icosphere(4, radius)
+    room = Room("ball", tuple(middle - radius), tuple(middle + radius))
+    scene = build().add(ball.vertices + middle, ball.faces[:, ::-1], albedo).scene(rooms=(room,))
+    lit = light(scene, **mode)
+    lit.hang(scene, LAMP)
+    stored = float(np.unique(lit.sector.surfel_albedo)[0])
+    expected = LAMP_FLUX / ball.area * stored / (1 - stored)
+    inside = np.linalg.norm(lit.sector.probe_position - middle, axis=1) < radius
+    assert inside.sum() >= 12
+    cubes = lit.cubes(uniform_sky())[inside]
+    # The ball has flat faces, on which the lamp is up to 0.6 % brighter in the middle; worst seen 0.2 %.
+    np.testing.assert_allclose(cubes, np.broadcast_to(expected, cubes.shape), rtol=ONE_PERCENT)
+
+
+# A box is not as even. Energy is kept exactly on walls (see the path tracer's own test), while probes stand in the air: the mean at them is
+# 1 to 3 % above the walls', path traced. The rest is the 2016 method's: a surfel takes the irradiance of the air before it, where there is
+# more of it than in corners, and each bounce adds to that. Worst seen 3.6, 5.8 and 9.1 %.
+@in_all_modes
+@pytest.mark.parametrize(("albedo", "bias"), [(0.3, 0.05), (0.5, 0.07), (0.8, 0.11)])
+def test_a_lamp_in_a_closed_box_gives_on_average_what_energy_says(build, light, albedo, bias, mode):
+    low, size = np.array([10.0, 0.0, 12.0]), np.array([16.0, 8.0, 12.0])
+    scene = build().box(low, low + size, albedo, inward=True).scene(rooms=(Room("box", tuple(low), tuple(low + size)),))
+    lit = light(scene, **mode)
+    lit.hang(scene, replace(LAMP, position=(17.0, 5.0, 17.0)))
+    stored = float(np.unique(lit.sector.surfel_albedo)[0])
+    expected = LAMP_FLUX / (2 * size @ np.roll(size, 1)) * stored / (1 - stored)
+    mean = lit.cubes(uniform_sky())[lit.sector.probe_room == 1].mean(axis=(0, 1), dtype=np.float64)
+    np.testing.assert_allclose(mean, expected, rtol=bias)
 
 
 @in_all_modes

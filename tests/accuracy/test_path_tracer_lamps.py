@@ -205,3 +205,26 @@ def test_lamps_that_reach_nowhere_near_are_never_drawn():
     assert len(near.point) == 1000
     np.testing.assert_allclose(near.irradiance, np.repeat(near.irradiance[:1], 1000, axis=0), rtol=1e-6)
     assert len(LampSampler([far]).draw(np.zeros((10, 3)), np.random.default_rng(0)).point) == 0
+
+
+@pytest.mark.parametrize("albedo", [0.3, 0.8])
+def test_walls_of_a_closed_room_get_a_lamps_flux_as_often_as_light_returns(build, albedo):
+    """What a lamp gives, walls absorb: their mean irradiance, without the lamp's own, is flux / area times rho / (1 - rho), in any room."""
+    low, size = np.array([-5.0, 0.0, -6.0]), np.array([16.0, 8.0, 12.0])
+    tracer = tracer_of(build().box(low, low + size, albedo, inward=True).scene())
+    points, normals = [], []
+    for axis in range(3):
+        step = np.delete(np.meshgrid(*(np.arange(0.5, n) for n in np.where(np.arange(3) == axis, 1, size)), indexing="ij"), axis, 0)
+        for side in (0, size[axis]):
+            wall = np.insert(step.reshape(2, -1), axis, side, axis=0).T
+            points.append(low + wall)
+            normals.append(np.tile(np.eye(3)[axis] * (1 if side == 0 else -1), (len(wall), 1)))
+    lamp = replace(POINT, range_m=1000.0)
+    found = tracer.surface_irradiance(np.concatenate(points), np.concatenate(normals), DARK, lamps=(lamp,), samples=64)
+    area = 2 * size @ np.roll(size, 1)
+    assert len(found.mean) == area  # a point for each square metre
+    flux = lamp.lumens * np.array(lamp.color) / (LUMINANCE_FROM_RGB @ np.array(lamp.color))
+    mean, error = found.mean.mean(axis=0), np.sqrt((found.standard_error**2).sum(axis=0)) / area
+    assert (error < 0.005 * mean).all()
+    # Half a percent for squares of a metre, which are lit unevenly where the lamp hangs near.
+    np.testing.assert_array_less(np.abs(mean - flux / area * albedo / (1 - albedo)), Z_MAX * error + 0.005 * mean)

@@ -12,10 +12,12 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from gi_core.clock_time import FIRST_YEAR, LAST_YEAR
+from gi_core.constants import SKY_SHAPE
 from gi_core.epw import EpwYear
 from gi_core.epw_weather import EpwWeather
 from gi_core.errors import InputError
-from gi_core.lighting import Lighting
+from gi_core.light_blend import LightVector, between_lightings, relative_changes
+from gi_core.lighting import DirectionalLight, Lighting
 from gi_core.lighting_model import make_lighting
 from gi_core.lighting_table import illuminance
 from gi_core.relight_input import relight_input
@@ -229,3 +231,57 @@ def test_no_picture_of_a_sky_makes_a_number_that_is_none(
         assert (array >= 0).all()
     assert math.isfinite(light.exposure)
     check_relight(light, SunTable.build(Location(), 90, 90))
+
+
+TABLE = SunTable.build(Location(), 30, 30)
+# 1e14 times the brightest that the model, a sky of one's own and the panel together give.
+MOST = 1e30
+LUX = st.one_of(st.sampled_from([0.0, 5e-324, 1e-45, MOST]), st.floats(0, MOST), st.floats(0, 1e5))
+
+
+@st.composite
+def snapshots(draw: st.DrawFn) -> Lighting:
+    """Any light, physical or not: lights below the horizon shine, and sky and cube have nothing to do with each other."""
+
+    def beam() -> DirectionalLight:
+        ends = st.sampled_from([(0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0)])
+        anywhere = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: np.linalg.norm(v) > 1e-3)
+        direction = np.array(draw(st.one_of(ends, anywhere)))
+        return DirectionalLight(direction / np.linalg.norm(direction), np.array(draw(st.tuples(LUX, LUX, LUX))))
+
+    sky = np.zeros((*SKY_SHAPE, 3), np.float32)
+    sky[:32:31], sky[1:31] = draw(LUX), draw(LUX)
+    cube = np.array(draw(st.lists(LUX, min_size=6, max_size=6)))[:, None] * np.ones(3)
+    share = st.floats(0, 1)
+    return Lighting("now", "any", beam(), beam(), sky, cube, draw(share), draw(LUX), draw(st.floats(-100, 100)))
+
+
+def finite(light: Lighting) -> None:
+    for array in (light.sky_radiance, light.sky_cube, light.sun.irradiance, light.moon.irradiance):
+        assert np.isfinite(array).all()
+        assert (array >= 0).all()
+    for beam in (light.sun, light.moon):
+        assert np.linalg.norm(beam.direction) == pytest.approx(1, abs=1e-12)
+        assert beam.direction[1] > 0 or not beam.irradiance.any()
+    assert 0 <= light.snow <= 1
+    assert np.isfinite([light.fog_density, light.exposure]).all()
+
+
+@given(
+    snapshots(), snapshots(), st.one_of(st.sampled_from([0.0, 0.5, 1.0]), st.floats(0, 1)), st.sampled_from([("faces", 6), ("patches", 24)])
+)
+@settings(max_examples=60, deadline=None)
+def test_between_any_two_lights_is_a_light_and_any_two_differ_by_a_number(
+    first: Lighting, second: Lighting, share: float, sky: tuple[str, int]
+) -> None:
+    between = between_lightings(first, second, share, "then")
+    finite(between)
+    vectors = [LightVector.of(relight_input(light, TABLE, *sky)) for light in (first, between, second)]
+    for vector in vectors:
+        assert np.isfinite(vector.numbers).all()
+        assert 0 <= vector.scale < math.inf
+    numbers = np.stack([vector.numbers for vector in vectors])
+    changes = relative_changes(numbers, np.array([vector.scale for vector in vectors]), vectors[1])
+    assert np.isfinite(changes).all()
+    assert (changes >= 0).all()
+    assert changes[1] == 0

@@ -4,21 +4,28 @@ import shutil
 import time
 from dataclasses import replace
 from datetime import datetime
+from itertools import count
 from pathlib import Path
+from threading import Lock
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from gi_core.constants import VOXEL_SIZE_M
 from gi_core.dataset import Dataset, sector_path
+from gi_core.device import shared_device
 from gi_core.engine import Engine
 from gi_core.errors import InputError
 from gi_core.grid import SectorIndex
 from gi_core.light_blend import LightVector
+from gi_core.light_geometry import ShadowGeometry
 from gi_core.lighting import Lighting
 from gi_core.lights import lamps_on
-from gi_core.live_sector import FADE_TICKS, LiveLight
+from gi_core.live_sector import FADE_TICKS, LiveLight, LiveSector
 from gi_core.live_volumes import HELD_TICKS
 from gi_core.live_world import LiveWorld, TickPlayers, TickReport
+from gi_core.relight import Relighter
 from gi_core.relight_input import relight_input
 from gi_core.settings import NEUTRAL, Settings
 from gi_core.stream import device_bytes
@@ -165,6 +172,110 @@ def test_a_sector_takes_no_more_than_the_budget_counts_for_it(golden):
 def test_a_basis_that_the_dataset_does_not_have_is_refused():
     with pytest.raises(InputError, match="this light is in cube"):
         LiveWorld(Dataset.open(GOLDEN), shadow_map=False, basis="sh2")
+
+
+@pytest.mark.parametrize(
+    "place",
+    [(0.0, 2.0, 30.0), (-1e-12, 2.0, 30.0), (-63.9, 2.0, 0.0), (25.0, 3.0, 28.0), (5.0, 150.0, 30.0)],
+    ids=["border", "just west of it", "edge of the world", "in a wall", "above all roofs"],
+)
+def test_wherever_a_player_is_its_volume_is_a_querys(world, engine, place):
+    lighting = engine.lighting("12:00", "clear")
+    found = Run(world).settle(at(np.array(place)), light_of(world, lighting))
+    np.testing.assert_array_equal(found, engine.volume(np.array(place), lighting).values)
+
+
+class FarDataset(Dataset):
+    """The golden dataset, 70 km away: by whole sectors that are whole voxels too."""
+
+    SECTORS = (775, -775)
+    METRES = np.array([775 * 64.0, 0.0, -775 * 64.0])
+
+    @classmethod
+    def shifted(cls) -> "FarDataset":
+        near = Dataset.open(GOLDEN)
+        moved = {cls.there(index): facts for index, facts in near.world.sectors.items()}
+        far = cls(near.path, replace(near.world, sectors=moved, bounds=near.world.bounds + cls.METRES), near.digest)
+        far.near = near
+        return far
+
+    @classmethod
+    def there(cls, index: SectorIndex, sign: int = 1) -> SectorIndex:
+        return SectorIndex(index.x + sign * cls.SECTORS[0], index.z + sign * cls.SECTORS[1])
+
+    def sector(self, index: SectorIndex):
+        sector = self.near.sector(self.there(index, -1))
+        return replace(sector, index=index, voxel_first=sector.voxel_first + (self.METRES / VOXEL_SIZE_M).astype(np.int32))
+
+    def geometry(self, index: SectorIndex):
+        geometry = self.near.geometry(self.there(index, -1))
+        return replace(geometry, vertices=geometry.vertices + self.METRES)
+
+    def distant(self):
+        texels = self.near.distant()
+        return replace(texels, origin=self.there(texels.origin))
+
+
+def test_seventy_kilometres_from_the_origin_nothing_changes(world, engine):
+    dataset = FarDataset.shifted()
+    far_world, far_engine = LiveWorld(dataset, shadow_map=False), Engine(dataset)
+    try:
+        lamp = Lamp("lamp", "point", (5.0, 6.0, 30.0), 5000.0)
+        far_engine.lamps = (replace(lamp, position=tuple(np.array(lamp.position) + FarDataset.METRES)),)
+        engine.lamps = (lamp,)
+        lighting = engine.lighting("12:00", "clear")
+        query = engine.volume(STREET, lighting)
+        far = far_engine.volume(STREET + FarDataset.METRES, lighting)
+        np.testing.assert_array_equal(far.values, query.values)
+        np.testing.assert_array_equal(far.mask, query.mask)
+        streamed = Run(far_world).settle(at(STREET + FarDataset.METRES), light_of(far_world, lighting, far_engine.lamps))
+        np.testing.assert_array_equal(streamed, query.values)
+    finally:
+        far_world.close()
+
+
+SIZES = [
+    {"probes": 0, "surfels": 0},
+    {"probes": 0},
+    {"probes": 1},
+    {"surfels": 0},
+    {"surfels": 1},
+    {"probes": 1000, "surfels": 3000},
+]
+
+
+@pytest.mark.parametrize("panel", [NEUTRAL, Settings(bounce_factor=2.0, lights_factor=0.5)], ids=["neutral", "gains"])
+@pytest.mark.parametrize("size", SIZES, ids=str)
+def test_a_sector_of_any_size_is_lit_shown_and_dark_again(make_sector, engine, size, panel):
+    """Under the sun of noon, its shadow map's samples, and a lamp; then without any of it."""
+    device, table = shared_device(), engine.dataset.world.sun_table
+    sector = make_sector(3, planes=table.plane_count, **size)
+    live = LiveSector(device, sector, 6, ShadowGeometry({}.__getitem__, []), Lock())
+    noon = engine.lighting("12:00", "snow")
+    dark = replace(
+        noon,
+        sun=replace(noon.sun, irradiance=np.zeros(3)),
+        moon=replace(noon.moon, irradiance=np.zeros(3)),
+        sky_radiance=0 * noon.sky_radiance,
+        sky_cube=0 * noon.sky_cube,
+    )
+    relighter, shown = Relighter(device), np.zeros((sector.probe_count, 6, 4), np.float32)
+    lamp = Lamp("lamp", "point", (32.0, 32.0, 32.0), 1e9, range_m=1e4)
+    number = count()
+    for lighting, lamps in ((noon, (lamp,)), (dark, ()), (noon, (lamp,))):
+        given = relight_input(lighting, table)
+        light = LiveLight(lighting, given, LightVector.of(given), panel.brightened(lamps), (), panel, False)
+        for _ in range(FADE_TICKS):
+            live.relight(relighter, light, 3)
+            assert 0 <= live.measure() < np.inf
+            live.advance(next(number), changed=True, is_read=True)
+        assert live.settle(relighter, light)
+        live.advance(next(number), changed=True, is_read=True)
+        device.read(live.shown(panel, lambda: np.zeros((6, 3), np.float32), "cube"), shown)
+        assert np.isfinite(shown).all()
+        assert shown.any() == (lighting is noon and sector.probe_count > 0)
+        assert live.is_lit
+        assert not live.is_fading
 
 
 def test_light_on_and_off_again_gives_the_first_bytes_back(world, engine):
@@ -320,6 +431,45 @@ def test_the_budget_holds_while_a_player_walks_to_and_fro(engine):
         assert np.isfinite(world.volumes.of_player["p0"].published.values).all()
     finally:
         world.close()
+
+
+def far_from_the_change(world, engine) -> tuple[TickPlayers, LiveLight]:
+    """A settled world of eight players whose volumes read both sectors: the even ones stand in the eastern one, the odd in the western."""
+    players, light = at(*[STREET - EAST * (k % 2 * 10 + k) for k in range(4)] * 2), light_of(world, engine.lighting("12:00", "clear"))
+    assert [int(x < 0) for x in players.positions[:, 0]] == [0, 1] * 4
+    Run(world).settle(players, light)
+    return players, light
+
+
+def test_whose_own_sector_was_relit_is_served_first_and_nobody_is_forgotten(world, engine):
+    players, light = far_from_the_change(world, engine)
+    order = []
+    for tick in range(1000, 1000 + len(players.ids)):
+        world.volumes.note(tick, players.ids, players.positions, [SectorIndex(-1, 0)] if tick == 1000 else [])
+        filled, waiting = world.volumes.fill(tick, -np.inf, lambda sector: world._shown(sector, light), world._placeholder)
+        assert len(filled) == 1
+        order += filled
+        assert waiting == len(players.ids) - len(order)
+    assert sorted(order) == sorted(players.ids)
+    assert set(order[:4]) == {"p1", "p3", "p5", "p7"}
+
+
+def test_no_volume_is_begun_when_the_ticks_time_for_them_is_over(world, engine, monkeypatch):
+    players, light = far_from_the_change(world, engine)
+    looks = count(1)
+    monkeypatch.setattr("gi_core.live_volumes.time", SimpleNamespace(perf_counter=lambda: float(next(looks))))
+    world.volumes.note(1000, players.ids, players.positions, [SectorIndex(0, 0)])
+    # A second passes with each look at the clock: the first volume needs none, one begins at 1 s, another at 2 s, none at 3 s.
+    filled, waiting = world.volumes.fill(1000, 3.0, lambda sector: world._shown(sector, light), world._placeholder)
+    assert (len(filled), waiting) == (3, 5)
+
+
+def test_without_any_time_left_two_sectors_are_relit_all_the_same(world, engine):
+    players, _ = far_from_the_change(world, engine)
+    afternoon = light_of(world, engine.lighting("16:00", "clear"), standing=False)
+    report = world.tick(1000, players, afternoon, fill_ms=-np.inf)
+    assert set(report.relit) == {SectorIndex(0, 0), SectorIndex(-1, 0)}
+    assert (len(report.filled), report.waiting) == (1, len(players.ids) - 1)
 
 
 def test_players_share_sectors_and_leave_nothing_behind(world, engine):

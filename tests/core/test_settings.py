@@ -11,12 +11,13 @@ from gi_core.basis import evaluate
 from gi_core.device import shared_device
 from gi_core.errors import InputError
 from gi_core.lighting import DirectionalLight, Lighting
+from gi_core.lights import MAX_LUMENS, check_lamp
 from gi_core.relight import Relighter
 from gi_core.relight_input import relight_input
 from gi_core.resident_sector import ResidentSector
-from gi_core.settings import MAX_FACTOR, NEUTRAL, Settings
+from gi_core.settings import MAX_AMBIENT_LX, MAX_FACTOR, NEUTRAL, Settings
 from gi_core.sun_table import SunTable
-from gi_core.world import Location
+from gi_core.world import Lamp, Location
 
 TABLE = SunTable.build(Location(), 30, 30)
 
@@ -92,8 +93,16 @@ def test_ambient_colours_are_the_same_light_in_harmonics():
 
 
 def test_every_gain_at_its_maximum_stays_finite(lit):
-    most = Settings(**{f.name: MAX_FACTOR for f in fields(Settings) if f.type in (float, "float")})
+    colours = (MAX_AMBIENT_LX,) * 3
+    most = Settings(**{f.name: colours if isinstance(f.default, tuple) else MAX_FACTOR for f in fields(Settings)})
     assert np.isfinite(lit(lighting(), most)).all()
+
+
+def test_a_lamp_that_gives_the_most_there_is_takes_any_gain():
+    lamp = Lamp("", "point", (0.0, 0.0, 0.0), MAX_LUMENS)
+    (found,) = Settings(lights_factor=MAX_FACTOR).brightened((lamp,))
+    check_lamp(found)
+    assert found.lumens == MAX_LUMENS
 
 
 @given(st.sampled_from([f.name for f in fields(Settings)]), st.sampled_from([-1.0, float("nan"), float("inf"), 1e9]))

@@ -50,6 +50,17 @@ def test_a_command_holds_from_the_tick_that_its_reply_names(live_http: httpx.Cli
     assert passed.total_seconds() == pytest.approx((later["tick"] - jumped["tick"]) / 20 * 60, abs=1e-6)
 
 
+def test_a_live_world_says_how_late_it_is(live_http: httpx.Client) -> None:
+    said = live_http.get("/v1/live").json()
+    late = said["lateness_ms"]
+    assert 0 < late["p50"] <= late["p99"] <= late["max"]  # no thread is woken without a delay
+    assert 0 <= said["late_ticks"] <= said["ticks"] <= said["tick"] + 1
+    # Each number is a tick that was made, that failed or that was skipped, but for the one that is under way.
+    assert said["tick"] <= said["ticks"] + said["failed_ticks"] + said["skipped"] <= live_http.get("/v1/live").json()["tick"] + 1
+    metrics = live_http.get("/metrics").text
+    assert {"sectorlight_late_ticks_total", "sectorlight_skipped_ticks_total"} <= {line.split()[0] for line in metrics.splitlines()}
+
+
 def test_a_paused_clock_stands_and_goes_on(live_http: httpx.Client, still: None) -> None:
     first = live_http.get("/v1/clock").json()
     second = until(lambda: (now := live_http.get("/v1/clock").json())["tick"] > first["tick"] and now)

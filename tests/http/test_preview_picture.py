@@ -4,6 +4,9 @@ import io
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from PIL import Image
 
 from gi_core.ambient_cube import FACE_DIRECTIONS
@@ -197,6 +200,27 @@ def test_tone_mapping_is_monotone_and_bounded() -> None:
     assert mapped.max() <= 1
     codes = tonemap.srgb_bytes(mapped)
     assert (codes[0], codes[-1]) == (0, 255)
+
+
+pixels_of_any_radiance = arrays(np.float32, (3, 4, 3), elements=st.floats(-(2.0**127), 2.0**127, width=32))
+
+
+@given(pixels_of_any_radiance, st.floats(-60, 140))
+@settings(max_examples=100, deadline=None)
+def test_any_finite_radiance_makes_a_picture(radiance: np.ndarray, sky_ev100: float) -> None:
+    ev100 = tonemap.metered(radiance, sky_ev100)
+    assert sky_ev100 <= ev100 < 140  # 2 ** 127 cd/m2 reads 130
+    assert np.isfinite(tonemap.exposed(np.abs(radiance), sky_ev100)).all()
+    linear = tonemap.exposed(radiance, ev100)
+    assert np.isfinite(linear).all()
+    mapped = tonemap.filmic(linear)
+    assert ((mapped >= 0) & (mapped <= 1)).all()
+    codes = tonemap.srgb_bytes(mapped)
+    # What is brighter is no darker in the picture.
+    order = np.argsort(radiance, axis=None)
+    assert (np.diff(codes.reshape(-1)[order].astype(int)) >= 0).all()
+    pixels = np.asarray(Image.open(io.BytesIO(tonemap.png(radiance, sky_ev100))))
+    np.testing.assert_array_equal(pixels, codes)
 
 
 def test_srgb_codes_are_the_standard_s() -> None:

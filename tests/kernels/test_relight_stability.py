@@ -1,6 +1,7 @@
 """The loop of bounces over many ticks: it never grows, never drifts, and forgets what was."""
 
 from dataclasses import replace
+from threading import Lock
 
 import numpy as np
 import pytest
@@ -8,9 +9,17 @@ import pytest
 from gi_core import factor_weights
 from gi_core.device import shared_device
 from gi_core.layout import DIRECTIONAL_LIGHT
+from gi_core.light_blend import LightVector
+from gi_core.light_geometry import ShadowGeometry
+from gi_core.lighting_model import make_lighting
+from gi_core.lights import MAX_LUMENS, MAX_RANGE_M
+from gi_core.live_sector import LiveLight, LiveSector
 from gi_core.relight import Relighter
-from gi_core.relight_input import RelightInput
+from gi_core.relight_input import RelightInput, relight_input
 from gi_core.resident_sector import ResidentSector
+from gi_core.settings import MAX_AMBIENT_LX, MAX_FACTOR, NEUTRAL, Settings
+from gi_core.sun_table import SunTable
+from gi_core.world import LAMP_KINDS, Lamp, Location
 
 PATCHES = 6
 DARK = RelightInput(np.zeros((PATCHES, 3), np.float32), np.zeros(0, DIRECTIONAL_LIGHT.dtype))
@@ -24,9 +33,9 @@ def sunlight(strength: float) -> RelightInput:
     return RelightInput(np.full((PATCHES, 3), strength * 0.1, np.float32), sun)
 
 
-def closed_white_room(make_sector, seed: int):
+def closed_white_room(make_sector, seed: int, **sizes):
     """Every probe sees surfels only, and each reflects all that a surface may: the loop loses no more than it must."""
-    sector = make_sector(seed)
+    sector = make_sector(seed, **sizes)
     bricks_only = np.where(sector.factor_source >= sector.brick_count, 0, sector.factor_source).astype(np.uint32)
     code, scale = factor_weights.encode(sector.factor_weight, sector.factor_starts, np.zeros(sector.factor_count, bool))
     white = np.full_like(sector.surfel_albedo, 0.95)
@@ -76,13 +85,37 @@ def test_no_strength_of_light_gives_nan_or_infinity(make_sector, strength):
     assert (found >= 0).all()
 
 
-@pytest.mark.slow
-def test_a_hundred_thousand_ticks_at_the_highest_gains_never_grow(make_sector):
-    resident = ResidentSector(shared_device(), closed_white_room(make_sector, 5), PATCHES)
-    bright = sunlight(1e9)
-    early = run(resident, bright, 2000)
-    late = run(resident, bright, 98_000)
-    np.testing.assert_allclose(late, early, rtol=20 * np.finfo(np.float32).eps)
+MOST = {name: (MAX_AMBIENT_LX,) * 3 if isinstance(getattr(NEUTRAL, name), tuple) else MAX_FACTOR for name in vars(NEUTRAL)}
+# In the middle of the sector's surfels, with all that a lamp may give.
+LAMPS = tuple(Lamp(kind, kind, (30.0, 30.0, 30.0), MAX_LUMENS, range_m=MAX_RANGE_M) for kind in LAMP_KINDS)
+
+
+@pytest.mark.parametrize("ticks", [3_000, pytest.param(100_000, marks=[pytest.mark.slow, pytest.mark.timeout(900)])])
+def test_with_all_gains_and_colours_at_their_maximum_ticks_never_grow(make_sector, ticks):
+    """As the live world makes them: light under the panel, lamps, a bounce, and what is shown of it."""
+    table = SunTable.build(Location(), 30, 30)
+    sector = closed_white_room(make_sector, 5, planes=table.plane_count)
+    panel = Settings(**MOST)
+    lighting = panel.light(make_lighting(Location(), "12:00", "snow"))
+    given = relight_input(lighting, table)
+    lamps = panel.brightened(LAMPS)
+    light = LiveLight(lighting, given, LightVector.of(given), lamps[:1], lamps[1:], panel, False)
+    device = shared_device()
+    relighter = Relighter(device)
+    live = LiveSector(device, sector, PATCHES, ShadowGeometry({}.__getitem__, []), Lock())
+    shown, kept = np.zeros((2, sector.probe_count, 6, 4), np.float32)
+    for tick in range(ticks):
+        live.relight(relighter, light, 1)
+        live.measure()
+        live.advance(tick, changed=True, is_read=True)
+        device.read(live.shown(panel, lambda: np.full((6, 3), MAX_AMBIENT_LX, np.float32), "cube"), shown)
+        if tick == 1_000:  # 0.95 ** 1000 is 5e-23: all that bounces will ever add is there
+            kept[:] = shown
+        elif tick % 1_000 == 0 or tick == ticks - 1:
+            assert np.isfinite(shown).all()
+            assert (shown >= 0).all()
+    assert kept.max() > MAX_FACTOR * MAX_LUMENS / 1e6  # lamps do light it
+    np.testing.assert_allclose(shown, kept, rtol=20 * np.finfo(np.float32).eps)
 
 
 @pytest.mark.slow

@@ -61,6 +61,21 @@ def test_the_map_equals_its_twin(device, elevation):
     assert (expected > shadow_map_twin.NOTHING_DRAWN).mean() > 0.05
 
 
+@pytest.mark.parametrize("elevation", [90.0, 30.0, 6.0])
+def test_triangles_seen_edge_on_shade_nothing_above_them(device, elevation):
+    """Walls along the sun's rays: rounding makes up their slope, and what lies behind would be shaded by hundreds of metres of it."""
+    rng, to_sun, count = np.random.default_rng(0), towards(elevation), 3000
+    a, b = rng.uniform(-60, 120, (2, count, 3))
+    aside = rng.normal(size=(count, 3)) * 10 ** rng.uniform(-7, -2, (count, 1))
+    c = a + rng.uniform(-0.5, 1.5, (count, 1)) * (b - a) + rng.uniform(-40, 40, (count, 1)) * to_sun + aside
+    corners = np.stack([a, b, c], axis=1)
+    shadow_map = drawn(device, corners, to_sun)
+    highest = shadow_map_twin.map_from_world(shadow_map.plan, corners)[..., 2].max()
+    found = shadow_map.read()
+    assert (found > shadow_map_twin.NOTHING_DRAWN).any()
+    assert found.max() <= highest + 1e-3  # float32 knows some hundred metres to 3e-5 m
+
+
 def samples_of(device, make_sector, seed: int, **changes) -> SunSamples:
     sector = make_sector(seed, surfels=2000)
     rng = np.random.default_rng(seed)
@@ -200,3 +215,22 @@ def test_an_unchanged_sun_gives_the_same_texels_wherever_the_player_stands(devic
     close = np.abs(a - moved)[inner, inner] < 5e-3
     both = (a[inner, inner] > -1e29) & (moved[inner, inner] > -1e29)
     assert close[both].mean() > 0.999
+
+
+def test_seventy_kilometres_from_the_origin_samples_are_the_same(device, make_sector):
+    shift = np.array([775 * 64.0, 0.0, -775 * 64.0])
+    near = samples_of(device, make_sector, 5)
+    far = SunSamples(device, ResidentSector(device, replace(near.resident.sector, index=SectorIndex(775, -775)), 6))
+    corners = random_city(3)
+    found = []
+    for samples, at in ((near, np.zeros(3)), (far, shift)):
+        index = samples.resident.sector.index
+        # A sector's triangles are local to it; the sun stands so that the shift is of whole texels.
+        shadow_map = ShadowMap(device, lambda _: triangle_records(corners), TOP)
+        shadow_map.begin(plan_map(MIDDLE + at, towards(90.0), {index}, 0.0, TOP))
+        assert shadow_map.draw(1)
+        shadow_map.sample(samples)
+        found.append(samples.read())
+    np.testing.assert_array_equal(found[1][0], found[0][0])
+    np.testing.assert_array_equal(found[1][1], found[0][1])
+    assert 0.02 < (found[0][0] == WHOLE_SAMPLE).mean() < 0.9
