@@ -1,5 +1,6 @@
 """The WebSocket stream of a player's volume: what a client holds, and what becomes of clients that misbehave."""
 
+import asyncio
 import contextlib
 import gc
 import io
@@ -7,9 +8,12 @@ import json
 import os
 import socket
 import struct
+import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from types import SimpleNamespace
 from typing import Any
 
 import httpx
@@ -19,13 +23,16 @@ from fastapi import FastAPI
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
+from gi_core.live_world import TickReport
 from server.app import create_app
+from server.first_frames import FirstFrames
 from server.frame_prefix import FrameKind
 from server.live import LiveOptions
 from server.player_streams import PlayerStreams, is_full_request
 from server.routes.live import memory_bytes
 from server.settings import Settings
 from server.stream_header import parse_header
+from server.tick_signal import TickSignal
 from server.volume_frames import Frame, VolumeDecoder, VolumeEncoder
 
 PATIENCE_S = 20.0
@@ -141,6 +148,59 @@ def test_frames_come_with_ticks(live_http: httpx.Client, player: str, racing: No
         assert all(frame.prefix.base == before for frame, before in zip(frames[1:], ticks, strict=False))
         assert abs(frames[-1].prefix.time_us / 1e6 - time.time()) < PATIENCE_S
         assert live_http.get("/v1/live").json()["streams"]["clients"] >= 1
+
+
+def test_first_frames_take_turns_in_the_order_of_arrival() -> None:
+    """At most so many in a tick; who has gone meanwhile takes no one's turn."""
+    came: list[int] = []
+
+    async def first_frame(frames: FirstFrames, number: int) -> None:
+        await frames.turn()
+        came.append(number)
+
+    async def run() -> None:
+        signal, ticker = TickSignal(), SimpleNamespace(listeners=[])
+        signal.follow(ticker)  # type: ignore[arg-type]
+
+        async def tick(number: int) -> None:
+            ticker.listeners[0](TickReport(number))
+            for _ in range(10):  # until all that it woke have gone as far as they can
+                await asyncio.sleep(0)
+
+        frames = FirstFrames(signal)
+        await tick(0)
+        clients = [asyncio.create_task(first_frame(frames, number)) for number in range(9)]
+        await asyncio.sleep(0)
+        assert came == [0, 1]
+        clients[3].cancel()
+        for number, expected in ((1, 4 + 1), (2, 6 + 1), (3, 8 + 1)):
+            await tick(number)
+            assert came == [n for n in range(expected) if n != 3]
+        # Nobody waits any more: the next tick's turns are there to be taken at once.
+        await tick(4)
+        await asyncio.wait_for(first_frame(frames, 10), 1.0)
+        assert came[-1] == 10
+        await asyncio.gather(*clients, return_exceptions=True)
+
+    asyncio.run(run())
+
+
+def test_clients_that_come_together_get_their_first_frames_one_tick_after_the_other(
+    live_http: httpx.Client, player: str, resting: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("server.first_frames.FIRST_FRAMES_PER_TICK", 1)
+    together = threading.Barrier(12)
+
+    def first_tick(_: int) -> int:
+        with following(live_http, player) as follower:
+            together.wait(PATIENCE_S)
+            frame = follower.next()
+            assert frame.prefix.kind == FrameKind.FULL
+            return frame.prefix.tick
+
+    with ThreadPoolExecutor(12) as clients:
+        ticks = sorted(clients.map(first_tick, range(12)))
+    assert ticks[-1] - ticks[0] >= 10
 
 
 def test_a_full_frame_comes_on_request_also_when_nothing_changes(live_http: httpx.Client, player: str, resting: None) -> None:
