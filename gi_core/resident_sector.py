@@ -20,7 +20,7 @@ from gi_core.arrays import AnyArray, Float32, UInt32
 from gi_core.basis import FEEDBACK, basis_of_size, conversion
 from gi_core.constants import BASIS_SIZES
 from gi_core.device import Device, SharedKernel
-from gi_core.layout import BOUNCE
+from gi_core.layout import BOUNCE, MAX_DIRECTIONAL_LIGHTS
 from gi_core.relight_input import RelightInput
 from gi_core.rooms import outdoor_blend
 from gi_core.sector import Sector, starts
@@ -90,6 +90,24 @@ class ResidentSector:
         """Bytes on the device."""
         own = sum(value.size for value in vars(self).values() if isinstance(value, cl.Buffer))
         return own + (sum(buffer.size for buffer in self._converted[1:]) if self._converted else 0)
+
+    @property
+    def lent_nbytes(self) -> int:
+        """Those of them that are another's: lamps' light and samples of the sun."""
+        return sum(int(lent.size) for lent in (self._lamps, self.sun_sample) if lent is not None)
+
+    @property
+    def host_nbytes(self) -> int:
+        """Bytes of the sector's arrays that are kept in the host's memory beside the device's."""
+        arrays = [value for value in vars(self.sector).values() if isinstance(value, np.ndarray)]
+        return sum(array.nbytes for array in arrays if any(array.strides))  # without strides it is one zero, whatever its shape
+
+    @property
+    def unused_nbytes(self) -> int:
+        """Bytes on the device that light may yet ask for: every directional light's share, and probes in the cube that is served."""
+        share = 4 * MAX_DIRECTIONAL_LIGHTS * self._groups * SURFELS_PER_GROUP - (0 if self.sun_share is None else int(self.sun_share.size))
+        cube = 0 if self._is_cube or self._converted else 16 * BASIS_SIZES["cube"] * self.sector.probe_count
+        return max(share, 0) + cube
 
     def prepare(self) -> None:
         """Do now what the first light would wait for, should another thread have the time."""

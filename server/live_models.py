@@ -150,7 +150,7 @@ class LiveReply(BaseModel):
     loads: int
     evictions: int
     resident_sectors: int
-    resident_bytes: int
+    resident_bytes: int = Field(description="of those, on the device and in the process's memory, as the budget counts them")
     loading: int
     failures: list[FailedSector]
     relit: int
