@@ -258,6 +258,39 @@ def raw_stream(http: httpx.Client, player: str) -> socket.socket:
     return connection
 
 
+def received(connection: socket.socket, seconds: float) -> int:
+    """Bytes that come off a socket in some seconds, whatever they are."""
+    count, end = 0, time.monotonic() + seconds
+    while (left := end - time.monotonic()) > 0:
+        connection.settimeout(left)
+        with contextlib.suppress(TimeoutError):
+            data = connection.recv(1 << 16)
+            assert data, "the server closed it"
+            count += len(data)
+    return count
+
+
+def test_a_stream_of_a_world_that_stands_still_is_silent(live_http: httpx.Client, player: str, resting: None) -> None:
+    with following(live_http, player) as follower:
+        follower.until_silent()
+    with raw_stream(live_http, player) as connection:
+        assert received(connection, 2.0) > 10_000  # header and first frame
+        # Not even pings, which come every 20 s: one of them is two bytes.
+        assert received(connection, 3.0) <= 2
+
+
+def test_a_stream_of_a_world_at_its_own_pace_takes_next_to_nothing(live_http: httpx.Client, player: str) -> None:
+    """For who stands under a clear sky at noon whose sun moves as the sun does: 0.0004 Mbit/s were seen."""
+    live_http.put("/v1/weather", json={"weather": "clear"})
+    live_http.put("/v1/clock", json={"time": "2024-06-21T12:00", "rate": 1, "paused": False})
+    try:
+        with raw_stream(live_http, player) as connection:
+            received(connection, 5.0)  # the first frame, and what follows a jump of the clock
+            assert 8e-6 * received(connection, 8.0) / 8.0 < 0.1
+    finally:
+        live_http.put("/v1/clock", json={"time": "12:00", "rate": 1, "paused": True})
+
+
 def test_a_client_that_stops_reading_costs_a_message_and_holds_up_nobody(
     live_http: httpx.Client, player: str, racing: None, streams: PlayerStreams
 ) -> None:
