@@ -18,7 +18,7 @@ $(VENV)/.ready: pyproject.toml
 	@touch $@
 
 $(VENV)/.judge: $(VENV)/.ready
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev,judge,sky]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev,docker,judge,sky]'
 	@touch $@
 
 $(VENV)/.docker: $(VENV)/.ready
@@ -34,7 +34,7 @@ demo: $(VENV)/.ready ## bake a small procedural city and serve it, with somebody
 test: $(VENV)/.ready ## the tests, without the slow ones
 	$(BIN)/python -m pytest
 
-test-all: $(VENV)/.judge ## every test: slow, statistical, and against Mitsuba
+test-all: $(VENV)/.judge ## every test: slow, statistical, against Mitsuba and Radiance, and linters of docker/
 	$(BIN)/python -m pytest -m ''
 
 check: $(VENV)/.ready ## the gate: format, lint, types, tests

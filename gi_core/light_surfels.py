@@ -10,12 +10,12 @@ import pyopencl as cl
 from gi_core.arrays import AnyArray, Float32
 from gi_core.device import Device
 from gi_core.grid import SectorIndex
-from gi_core.layout import AREA_SHADOW_RAYS, LOCAL_AREA, LOCAL_LIGHT, SURFELS_PER_WORD
+from gi_core.layout import AREA_SHADOW_RAYS, LOCAL_AREA, LOCAL_LIGHT, SURFEL_WORD, SURFELS_PER_WORD
 from gi_core.light_geometry import ShadowGeometry
 from gi_core.light_plan import MAX_LIGHTS_PER_LAUNCH, SurfelBounds, changed_spheres, surfel_words, touching_lamps
 from gi_core.lights import check_lamp, light_records
 from gi_core.sector import Sector
-from gi_core.shadow_bits import Shadow, ShadowBits
+from gi_core.shadow_bits import FIRST_PLANES, Shadow, ShadowBits
 from gi_core.world import Lamp
 
 # Work-items per work-group; kernels guard against the last group's excess.
@@ -59,6 +59,12 @@ class SurfelLights:
         """Bytes on the device, without the geometry's, which all sectors share."""
         held = (self.buffer, self._places, self._static_sum)
         return self._bits.nbytes + sum(int(buffer.size) for buffer in held if buffer is not None)
+
+    @property
+    def unused_nbytes(self) -> int:
+        """Bytes on the device that the first lamps to touch the sector would take: both sums, places, and the first planes of shadows."""
+        room = 2 * 16 * self._sector.surfel_count + (SURFEL_WORD.dtype.itemsize + 4 * FIRST_PLANES) * self._words
+        return max(room - self.nbytes, 0)
 
     @property
     def given(self) -> tuple[tuple[Lamp, ...], tuple[Lamp, ...]]:

@@ -84,6 +84,8 @@ class LiveSector:
         self._low, self._high = _bounds(sector)
         self._faded = 0
         self._cubes: Float32 = np.zeros((sector.probe_count, sector.basis_size, 3), np.float32)
+        self.host_nbytes = self.resident.host_nbytes + self._cubes.nbytes
+        """Bytes in the host's memory."""
         self._shown: cl.Buffer | None = None
         self._first: cl.Buffer | None = None
         self._room: cl.Buffer | None = None
@@ -93,8 +95,21 @@ class LiveSector:
     @property
     def nbytes(self) -> int:
         """Bytes on the device."""
-        own = sum(int(b.size) for b in (self._shown, self._first, self._room) if b is not None)
-        return self.resident.nbytes + self.lamps.nbytes + own + (self.samples.nbytes if self.samples else 0)
+        return self.resident.nbytes + self.lamps.nbytes + self._shown_nbytes + (self.samples.nbytes if self.samples else 0)
+
+    @property
+    def _shown_nbytes(self) -> int:
+        return sum(int(buffer.size) for buffer in (self._shown, self._first, self._room) if buffer is not None)
+
+    def budget_bytes(self, lamps: bool) -> int:
+        """What the budget counts: bytes on the device and in the host's memory, and room for all that light may yet ask for, so that what
+        was counted stays true from sunrise to sunset; of ``lamps`` only where there are any."""
+        sector = self.resident.sector
+        samples = 0 if self.samples else SunSamples.nbytes_of(sector.surfel_count)
+        # Fading and gains: two copies of the probes, and their rooms.
+        shown = (2 * 16 * sector.basis_size + 2) * sector.probe_count - self._shown_nbytes
+        room = self.resident.unused_nbytes(lamps) + samples + max(shown, 0) + (self.lamps.unused_nbytes if lamps else 0)
+        return self.nbytes + self.host_nbytes + room
 
     @property
     def is_fading(self) -> bool:

@@ -92,7 +92,8 @@ class LiveWorld:
     ) -> None:
         """A queue of its own on the device, so that queries and ticks do not wait for each other.
 
-        budget_bytes : of resident sectors on the device; places : sectors to relight in a tick; basis : of players' volumes
+        budget_bytes : of resident sectors, on the device and in the host's memory
+        places : sectors to relight in a tick; basis : of players' volumes
         Raises DeviceError, and InputError for a basis that the dataset cannot be served in.
         """
         self.dataset = dataset
@@ -105,6 +106,7 @@ class LiveWorld:
         self._geometry = ShadowGeometry(dataset.geometry, dataset.world.sectors)
         self._tracing = threading.Lock()
         self.streamer = Streamer(sector_table(dataset.world), dataset.sector, self._place, stream or StreamOptions(budget_bytes))
+        self.streamer.lamps_planned = bool(dataset.world.lamps)
         self.volumes = LiveVolumes(self._device, frozenset(dataset.world.sectors), self.streamer.residents, basis)
         self._needs = LightNeeds(len(self.streamer.table.sectors))
         self._row = {index: row for row, index in enumerate(self.streamer.table.sectors)}
@@ -199,10 +201,12 @@ class LiveWorld:
             self._shadows.close()
 
     def lamps_moved(self, touched: Sequence[tuple[Float64, float]]) -> None:
-        """Lamps at positions (3,) [m] with ranges [m] have changed: sectors with a surface in range need light at once."""
+        """Lamps at positions (3,) [m] with ranges [m] have changed: sectors with a surface in range need light at once, and room for it."""
+        self.streamer.lamps_planned |= bool(touched)
         for index, sector in self.streamer.residents.items():
             if any(sector.reaches(position, range_m) for position, range_m in touched):
                 self._needs.disturb(self._row[index], WHOLLY)
+                self.streamer.count_again(index, lamps=True)
 
     def _place(self, sector: Sector) -> LiveSector:
         """In a loader's thread: on the device, with the shadows of the lamps that shine now."""
@@ -242,6 +246,9 @@ class LiveWorld:
                 if residents[index].settle(self._relighter, light):
                     needs.relit(row, tick, light.vector, 0.0, exact=True)
                     report.settled = (index,)
+        for index in (*report.relit, *report.settled):
+            if residents[index].lamps.nbytes:  # dozens of lamps cast more shadows than there was room for
+                self.streamer.count_again(index, lamps=False)
 
     def _shown(self, sector: LiveSector, light: LiveLight) -> cl.Buffer:
         return sector.shown(light.settings, lambda: self._placeholder(sector.resident.sector.index), self.basis)

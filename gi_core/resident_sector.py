@@ -21,7 +21,7 @@ from gi_core.arrays import AnyArray, Float32, UInt32
 from gi_core.basis import FEEDBACK, basis_of_size, conversion
 from gi_core.constants import BASIS_SIZES
 from gi_core.device import Device
-from gi_core.layout import BOUNCE
+from gi_core.layout import BOUNCE, MAX_DIRECTIONAL_LIGHTS
 from gi_core.relight_input import RelightInput
 from gi_core.relight_launch import SURFELS_PER_GROUP, About, Launch, relight_launch
 from gi_core.rooms import outdoor_blend
@@ -96,6 +96,20 @@ class ResidentSector:
         """Bytes on the device, without what is lent to it: lamps' light and samples of the sun."""
         own = sum(value.size for name, value in vars(self).items() if isinstance(value, cl.Buffer) and name not in _LENT)
         return own + (sum(buffer.size for buffer in self._converted[1:]) if self._converted else 0)
+
+    @property
+    def host_nbytes(self) -> int:
+        """Bytes of the sector's arrays that are kept in the host's memory beside the device's."""
+        arrays = [value for value in vars(self.sector).values() if isinstance(value, np.ndarray)]
+        return sum(array.nbytes for array in arrays if any(array.strides))  # without strides it is one zero, whatever its shape
+
+    def unused_nbytes(self, lamps: bool) -> int:
+        """Bytes on the device that light may yet ask for: each directional light's share, lamps by brick if there are ``lamps``, and probes
+        in the cube that is served."""
+        share = 4 * MAX_DIRECTIONAL_LIGHTS * self.groups * SURFELS_PER_GROUP - (0 if self.sun_share is None else int(self.sun_share.size))
+        cube = 0 if self._is_cube or self._converted else 16 * BASIS_SIZES["cube"] * self.sector.probe_count
+        by_brick = 16 * self.sector.brick_count if lamps and self.lamps_on_bricks is None else 0
+        return max(share, 0) + by_brick + cube
 
     def prepare(self) -> None:
         """Do now what the first light would wait for, should another thread have the time."""

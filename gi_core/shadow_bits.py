@@ -10,7 +10,7 @@ from gi_core.lights import shadow_planes
 from gi_core.world import Lamp
 
 Stand = tuple[object, ...]
-_FIRST_PLANES = 32
+FIRST_PLANES = 32
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +75,7 @@ class ShadowBits:
         """The buffer, with room for all that was added; what it held is in it still."""
         wanted = self._used * self._plane_bytes
         if self.buffer is None or wanted > self.buffer.size:
-            held, self.buffer = self.buffer, self._device.allocate(max(wanted, _FIRST_PLANES * self._plane_bytes, 2 * self.nbytes))
+            held, self.buffer = self.buffer, self._device.allocate(max(wanted, FIRST_PLANES * self._plane_bytes, 2 * self.nbytes))
             if held is not None:
                 cl.enqueue_copy(self._device.queue, self.buffer, held)
         return self.buffer

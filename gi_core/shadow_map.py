@@ -51,6 +51,11 @@ class SunSamples:
         self._framed: ShadowPlan | None = None
         self._frame: AnyArray
 
+    @staticmethod
+    def nbytes_of(surfels: int) -> int:
+        """Bytes on the device that samples of so many surfels take."""
+        return (16 + 1 + 2) * -(-surfels // SURFELS_PER_GROUP) * SURFELS_PER_GROUP
+
     @property
     def nbytes(self) -> int:
         """Bytes on the device."""

@@ -20,8 +20,11 @@ from gi_core.stream_plan import StreamOptions, StreamPlan, StreamState, plan_str
 
 log = logging.getLogger("sectorlight.stream")
 
-# Bytes on the device of one item, and a little for what is not counted: see ResidentSector and SunSamples.
-_BYTES_PER = {"probes": 256, "factors": 16, "bricks": 64, "surfels": 112, "voxels": 32}
+# Bytes on the device of one item, and a little for what is not counted: see ResidentSector, SunSamples and SurfelLights.
+_BYTES_PER = {"probes": 256, "factors": 16, "bricks": 80, "surfels": 128, "voxels": 32}
+# And in the host's memory: see ResidentSector.release_host_arrays.
+_HOST_BYTES_PER = {"probes": 24, "bricks": 20, "surfels": 36, "voxels": 3}
+_HOST_BYTES_PER_COEFFICIENT, _HOST_BYTES_PER_FEEDBACK = 16, 6
 _BYTES_PER_SECTOR = 1 << 15
 
 
@@ -31,9 +34,11 @@ _BYTES_PER_COEFFICIENT, _BRICK_BASIS_BYTES, _SERVED_BYTES = 48, 4, 96
 _BYTES_PER_BOUNCE = 16
 
 
-def device_bytes(facts: SectorFacts, sun_planes: int, voxel_probes: int, coefficients: int = 6, feedback_probes: int = 1) -> int:
-    """What a sector takes on the device at most, from what the index says of it: with sun, snow, lamps and samples."""
-    counted = sum(size * int(getattr(facts, name)) for name, size in _BYTES_PER.items())
+def most_bytes(facts: SectorFacts, sun_planes: int, voxel_probes: int, coefficients: int = 6, feedback_probes: int = 1) -> int:
+    """What a sector takes at most, on the device and in the host's memory, from what the index says of it: with sun, snow, lamps and
+    samples. About twice what it takes."""
+    counted = sum(size * int(getattr(facts, name)) for per in (_BYTES_PER, _HOST_BYTES_PER) for name, size in per.items())
+    counted += facts.probes * _HOST_BYTES_PER_COEFFICIENT * coefficients + facts.surfels * _HOST_BYTES_PER_FEEDBACK * feedback_probes
     counted += _BYTES_PER_BOUNCE * facts.surfels * (feedback_probes - 1)
     if coefficients != BASIS_SIZES["cube"]:
         more = max(coefficients - BASIS_SIZES["cube"], 0)
@@ -45,7 +50,7 @@ def sector_table(world: WorldInfo) -> SectorTable:
     """The world's sectors for streaming plans."""
     planes, blended = world.sun_table.plane_count, int(world.settings.get("voxel_probes", 4))
     size, feedback = BASIS_SIZES[world.basis], int(world.settings.get("feedback_probes", 1))
-    return SectorTable.of({index: device_bytes(facts, planes, blended, size, feedback) for index, facts in world.sectors.items()})
+    return SectorTable.of({index: most_bytes(facts, planes, blended, size, feedback) for index, facts in world.sectors.items()})
 
 
 @dataclass(frozen=True)
@@ -58,7 +63,10 @@ class Failure:
 
 
 class Streamer:
-    """The sectors that are resident. ``residents`` is the ticker's: loaders only hand over what is whole."""
+    """The sectors that are resident. ``residents`` is the ticker's: loaders only hand over what is whole.
+
+    A sector that loads counts as the most that it may take, one that is there as what it takes (LiveSector.budget_bytes).
+    """
 
     def __init__(
         self, table: SectorTable, load: Callable[[SectorIndex], Sector], place: Callable[[Sector], LiveSector], options: StreamOptions
@@ -67,6 +75,8 @@ class Streamer:
         self.residents: dict[SectorIndex, LiveSector] = {}
         self.failures: dict[SectorIndex, Failure] = {}
         self.loads = self.misses = 0
+        self.lamps_planned = False
+        """Whether sectors that arrive are counted with room for lamps."""
         self.table, self._load, self._place, self._options = table, load, place, options
         self._row = {index: row for row, index in enumerate(table.sectors)}
         self._state = StreamState.empty(table)
@@ -83,7 +93,7 @@ class Streamer:
 
     @property
     def resident_bytes(self) -> int:
-        """Bytes on the device, as the plan counts them."""
+        """Bytes on the device and in the host's memory, as the plan counts them."""
         return int(self._state.resident_bytes.sum())
 
     def take_over(self) -> list[SectorIndex]:
@@ -100,7 +110,7 @@ class Streamer:
             if isinstance(found, LiveSector):
                 self.residents[index] = found
                 self._rows = np.append(self._rows, row)
-                self._state.resident_bytes[row] = max(found.nbytes, int(self.table.bytes[row]))
+                self._state.resident_bytes[row] = found.budget_bytes(self.lamps_planned)
                 self._state.retry_at_s[row] = 0.0
                 self.failures.pop(index, None)
                 self.loads += 1
@@ -125,6 +135,11 @@ class Streamer:
             self._loader.submit(self._bring, index)
         self.misses += len(plan.missing)
         return plan
+
+    def count_again(self, index: SectorIndex, lamps: bool) -> None:
+        """Count what a resident sector takes now, with room for ``lamps`` or not, where that is more: the next step makes it fit."""
+        row = self._row[index]
+        self._state.resident_bytes[row] = max(int(self._state.resident_bytes[row]), self.residents[index].budget_bytes(lamps))
 
     def resident_rows(self) -> Int64:
         """Rows of the table that are resident, in the order of their arrival."""

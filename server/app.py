@@ -35,6 +35,7 @@ from server.routes import (
     metrics as metrics_route,
 )
 from server.routes import settings as live_settings
+from server.server_timing import TellTotal
 from server.service import Service
 from server.settings import Settings
 from server.version import program_version
@@ -72,6 +73,7 @@ def app_of(service: Service) -> FastAPI:
     app.add_middleware(CountRequests, metrics=metrics)
     app.add_middleware(AnswerFromFinished, replies=service.replies, count=metrics.count_request)
     app.add_middleware(HeadRequests)
+    app.add_middleware(TellTotal)
     problems.install(app)
     stateless = (world, lighting, volume, distant, sectors, probes, preview)
     for resource in (health, metrics_route, *stateless, clock, weather, live_settings, lights, players, player_volume, live):

@@ -21,7 +21,7 @@ def loadtest(
     seconds: Annotated[float, typer.Option(min=1, max=1e6, help="How long, once all players are there.")] = 30.0,
     warm_up: Annotated[
         float,
-        typer.Option(min=0, max=1e6, help="Seconds that players walk before anything is counted; tick percentiles are the last minute's."),
+        typer.Option(min=0, max=1e6, help="Seconds that players walk before anything is counted."),
     ] = 0.0,
     path: Annotated[
         Path | None,
@@ -39,12 +39,20 @@ def loadtest(
         float, typer.Option(min=0.001, max=1, help="A voxel pops when it changes by more than this share between two ticks.")
     ] = 0.2,
     max_tick_p99_ms: Annotated[float | None, typer.Option(help="Exit 1 above this: 99th percentile of the server's ticks.")] = None,
+    max_lateness_p99_ms: Annotated[
+        float | None, typer.Option(help="Exit 1 above this: 99th percentile of how late ticks begin after they were due.")
+    ] = None,
     max_late_share: Annotated[float | None, typer.Option(help="Exit 1 above this: late ticks, as a share of all.")] = None,
+    max_skipped: Annotated[int | None, typer.Option(help="Exit 1 above this: ticks whose time had passed before they could begin.")] = None,
     max_volume_p99_ms: Annotated[float | None, typer.Option(help="Exit 1 above this: 99th percentile of a volume's latency.")] = None,
     max_megabits: Annotated[float | None, typer.Option(help="Exit 1 above this: Mbit/s per player.")] = None,
     max_misses: Annotated[int | None, typer.Option(help="Exit 1 above this: ticks of players in sectors without light.")] = None,
     max_pops: Annotated[int | None, typer.Option(help="Exit 1 above this: voxels that popped, but for jumps of the clock.")] = None,
     max_errors: Annotated[int | None, typer.Option(help="Exit 1 above this: requests, streams and frames that failed.")] = None,
+    max_cache_miss_share: Annotated[
+        float | None, typer.Option(help="Exit 1 above this: queries and players' volumes made anew, as a share of all that were asked for.")
+    ] = None,
+    max_memory_gained_mb: Annotated[float | None, typer.Option(help="Exit 1 above this: by how much the server's memory grew.")] = None,
 ) -> None:
     """Put players into a running server's world, follow each with a client, and report how the server keeps up.
 
@@ -68,7 +76,19 @@ def loadtest(
         pop_bound,
         warm_up,
     )
-    limits = Limits(max_tick_p99_ms, max_late_share, max_volume_p99_ms, max_megabits, max_misses, max_pops, max_errors)
+    limits = Limits(
+        tick_p99_ms=max_tick_p99_ms,
+        lateness_p99_ms=max_lateness_p99_ms,
+        late_share=max_late_share,
+        skipped=max_skipped,
+        volume_p99_ms=max_volume_p99_ms,
+        megabits=max_megabits,
+        misses=max_misses,
+        pops=max_pops,
+        errors=max_errors,
+        cache_miss_share=max_cache_miss_share,
+        memory_gained_mb=max_memory_gained_mb,
+    )
     with writing(json_path or plot_path):
         missed, interrupted = loadtest_command.run_command(options, limits, json_path, plot_path)
     for line in missed:

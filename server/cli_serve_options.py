@@ -56,7 +56,13 @@ def serve(
     ] = "clear",
     budget_mb: Annotated[
         int,
-        typer.Option(envvar="SECTORLIGHT_BUDGET_MB", min=16, max=1 << 20, help="Memory of the live world's sectors; never exceeded."),
+        typer.Option(
+            envvar="SECTORLIGHT_BUDGET_MB",
+            min=16,
+            max=1 << 20,
+            help="Memory of the live world's sectors, on the device and in this process; never exceeded. Volumes (some 4 MB a player "
+            "with a stream), shadow maps and queries come on top.",
+        ),
     ] = 384,
 ) -> None:
     """Serve a dataset over HTTP: its light at any hour and weather, and a live world with a clock, lights and players."""

@@ -103,6 +103,12 @@ class PlayerVolumeQuery(VolumeFormatQuery):
     since: int | None = Field(None, ge=-1, le=LARGEST_INTEGER, description="the tick that the client has: 304 when there is no later one")
 
 
+class LiveQuery(StrictQuery):
+    since: int | None = Field(
+        None, ge=-1, le=LARGEST_INTEGER, description="a tick: each later one of the last minute is told of in `recent`"
+    )
+
+
 class DistantQuery(LightingQuery):
     format: ArrayFormat = "npy"
     encoding: Literal["f16"] = "f16"

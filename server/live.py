@@ -33,7 +33,7 @@ class LiveOptions:
     """What an operator decides about the live world.
 
     ticks_per_second : of real time; start_time, start_weather : as queries take them
-    budget_bytes : of resident sectors on the device; places : sectors relit in a tick
+    budget_bytes : of resident sectors, on the device and in this process; places : sectors relit in a tick
     players_file : who walks from the start; state_file : where edits that ask to be kept are kept; epw_file : a measured year's weather
     sky : in place of the model's
     """

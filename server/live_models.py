@@ -106,6 +106,14 @@ class Percentiles(BaseModel):
     max: float
 
 
+class TickTimes(BaseModel):
+    """A list of ticks, and of each how long it took and how late it began."""
+
+    tick: list[int]
+    ms: list[float]
+    lateness_ms: list[float]
+
+
 class FailedSector(BaseModel):
     sector: tuple[int, int]
     attempts: int
@@ -142,7 +150,7 @@ class LiveReply(BaseModel):
     loads: int
     evictions: int
     resident_sectors: int
-    resident_bytes: int
+    resident_bytes: int = Field(description="of those, on the device and in the process's memory, as the budget counts them")
     loading: int
     failures: list[FailedSector]
     relit: int
@@ -155,3 +163,4 @@ class LiveReply(BaseModel):
     streams: Streams
     memory_bytes: int | None
     cache: CacheCounts
+    recent: TickTimes | None = Field(description="ticks of the last minute that are later than `since`; null without it")

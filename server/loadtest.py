@@ -190,16 +190,16 @@ async def _watch_server(
 
 
 async def _ask_live(http: httpx.AsyncClient, watch: Watch) -> None:
+    known = watch.recorder.known_tick
     try:
-        reply = await http.get("/v1/live")
+        reply = await http.get("/v1/live", params={} if known is None else {"since": known})
         members = reply.json() if reply.status_code == 200 else None
+        if isinstance(members, dict):
+            watch.recorder.server(Live(watch.now(), members))
+        else:
+            watch.error(f"GET /v1/live: status {reply.status_code}")
     except (httpx.HTTPError, ValueError) as error:
         watch.error(f"GET /v1/live: {type(error).__name__}")
-        return
-    if isinstance(members, dict):
-        watch.recorder.live.append(Live(watch.now(), members))
-    else:
-        watch.error(f"GET /v1/live: status {reply.status_code}")
 
 
 async def _ask_clock(http: httpx.AsyncClient, watch: Watch, last: tuple[float, float, float] | None) -> tuple[float, float, float] | None:

@@ -19,6 +19,7 @@ from server.loadtest import Options, Path3, run
 from server.loadtest_limits import Limits
 from server.loadtest_record import Recorder
 
+CACHE_COUNTS = ("hits", "misses", "player_volume_hits", "player_volume_misses")
 MAX_PATH_FILE_BYTES = 1 << 26
 # Above this the load test itself is what is slow, and its latencies are its own.
 BUSY_CLIENT = 0.9
@@ -93,13 +94,15 @@ def table_of(report: dict[str, Any]) -> Table:
     table.add_column("", justify="right")
     rows = {
         "tick p50 / p99 / max [ms]": _numbers(*(report["tick_ms"][name] for name in ("p50", "p99", "max"))),
-        "late ticks, of all": _numbers(report["late_ticks"], report["ticks"]),
+        "lateness p50 / p99 / max [ms]": _numbers(*(report["lateness_ms"][name] for name in ("p50", "p99", "max"))),
+        "late ticks, skipped, of all": _numbers(report["late_ticks"], report["skipped"], report["ticks"]),
         f"volume latency since {report['volume_ms_since']} p50 / p99 [ms]": _numbers(*report["volume_ms"].values()),
         "Mbit/s per player": _numbers(8e-6 * report["bytes_per_second_per_player"]),
         "misses": _numbers(report["misses"]),
         f"pops (beyond {report['pop_bound']:.0%} in a tick), around jumps": _numbers(report["pops"], report["pops_in_jumps"]),
         "frames, full, not judged": _numbers(report["frames"], report["full_frames"], report["frames_not_judged"]),
         "errors": _numbers(report["errors"]),
+        "cache hits / misses of queries, of players' volumes": _numbers(*(report["cache"].get(name) for name in CACHE_COUNTS)),
         "server memory, gained [MB]": _numbers(*(_mega(report[name]) for name in ("memory_bytes", "memory_bytes_gained"))),
         "this client's share of a core": _numbers(report["client_cpu_share"]),
     }

@@ -1,21 +1,21 @@
-"""A load test as a picture: tick time, volume latency, bytes and mishaps, second by second."""
+"""A load test as a picture: tick time, volume latency, bytes, mishaps and the server's memory, second by second."""
 
 from collections.abc import Sequence
 from typing import Any
 
 from PIL import Image, ImageDraw
 
-SIZE = (900, 760)
+SIZE = (900, 940)
 MARGIN = (70, 40, 20, 30)  # left, top, right, bottom
 GAP = 34  # between panels, for their titles
 GRID, AXIS = "#dddddd", "black"
-COLOURS = ("#4878a8", "#d08a3c", "#5f9e5a", "#b85a5a")
+COLOURS = ("#4878a8", "#d08a3c", "#5f9e5a", "#b85a5a", "#7a68a6")
 
 Series = Sequence[float | None]
 
 
 def draw(report: dict[str, Any]) -> Image.Image:
-    """Four panels over the seconds of the test; grey bands are seconds around a jump of the world's clock."""
+    """Five panels over the seconds of the test; grey bands are seconds around a jump of the world's clock."""
     rows = report["per_second"]
 
     def column(name: str, factor: float = 1.0) -> list[float | None]:
@@ -24,12 +24,13 @@ def draw(report: dict[str, Any]) -> Image.Image:
     panels: list[tuple[str, dict[str, Series], float | None]] = [
         (
             "tick [ms]; line: the time between two ticks",
-            _pair("tick_ms", column),
+            _pair("tick_ms", column) | {"late p99": column("lateness_ms_p99")},
             1e3 / report["tick_rate"] if report["tick_rate"] else None,
         ),
         (f"volume latency since {report['volume_ms_since']} [ms]", _pair("volume_ms", column), None),
         ("stream [Mbit/s per player]", {"mean": column("bytes_per_player", 8e-6)}, None),
-        ("in each second", {name: column(name) for name in ("late_ticks", "misses", "pops", "errors")}, None),
+        ("in each second", {name: column(name) for name in _COUNTS}, None),
+        ("the server's memory [MB]", {"resident": column("memory_bytes", 1e-6)}, None),
     ]
     image = Image.new("RGB", SIZE, "white")
     pen = ImageDraw.Draw(image)
@@ -51,7 +52,7 @@ def _title(report: dict[str, Any]) -> str:
     return f"{report['players']} players at {report['speed']:g} m/s, {report['mode']}, {report['seconds']:.0f} s: {counts}"
 
 
-_COUNTS = ("late_ticks", "misses", "pops", "errors")
+_COUNTS = ("late_ticks", "skipped", "misses", "pops", "errors")
 
 
 def _panel(

@@ -1,6 +1,7 @@
 """What a load test sees, second by second, and the figures it comes to."""
 
 import math
+from bisect import bisect_right
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -16,9 +17,11 @@ SECONDS_AROUND_A_JUMP = 2
 
 @dataclass
 class Second:
-    """Sums over one second of the test."""
+    """One second of the test: its sums, and what its ticks took and how late they began."""
 
     latency_ms: list[float] = field(default_factory=list)
+    tick_ms: list[float] = field(default_factory=list)
+    lateness_ms: list[float] = field(default_factory=list)
     bytes: int = 0
     frames: int = 0
     pops: int = 0
@@ -39,6 +42,14 @@ class Live:
             value = value.get(name) if isinstance(value, dict) else None
         return float(value) if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value) else None
 
+    def ticks(self) -> tuple[list[int], list[float], list[float]]:
+        """The ticks that it tells of one by one: their numbers, what each took [ms], how late each began [ms]. Raises ValueError."""
+        try:
+            numbers, took_ms, lateness_ms = (self.members["recent"][name] for name in ("tick", "ms", "lateness_ms"))
+            return [int(n) for n in numbers], [float(ms) for ms in took_ms], [float(ms) for ms in lateness_ms]
+        except (KeyError, TypeError) as error:
+            raise ValueError(f"expected members tick, ms and lateness_ms of recent ({error})") from error
+
 
 class Recorder:
     """Collects from all clients of one test. Times are seconds since its start."""
@@ -47,6 +58,8 @@ class Recorder:
         self.seconds: defaultdict[int, Second] = defaultdict(Second)
         self.jumps: set[int] = set()
         self.live: list[Live] = []
+        self.known_tick: int | None = None
+        """The last tick of the server's that is taken in, or from before the test; None before it has told of any."""
         self.errors: Counter[str] = Counter()
         self.full_frames = 0
         self.unjudged_frames = 0
@@ -68,6 +81,23 @@ class Recorder:
         self.seconds[int(at)].errors += 1
         self.errors[text if text in self.errors or len(self.errors) < MAX_QUOTED_ERRORS else "others"] += 1
 
+    def server(self, said: Live) -> None:
+        """The server said how it does, and how each tick went that is later than ``known_tick``. Raises ValueError where it did not."""
+        self.live.append(said)
+        tick, rate = said.number("tick"), said.number("tick_rate")
+        if tick is None or rate is None or rate <= 0:
+            return
+        if self.known_tick is None:
+            self.known_tick = int(tick) - 1  # the tick itself may not be over
+            return
+        numbers, took_ms, lateness_ms = said.ticks()
+        for number, took, lateness in zip(numbers, took_ms, lateness_ms, strict=True):
+            second = self.seconds[int(max(said.at - (tick - number) / rate, 0.0))]
+            second.tick_ms.append(took)
+            second.lateness_ms.append(lateness)
+        # A server that was started anew counts from 0 again.
+        self.known_tick = numbers[-1] if numbers else min(self.known_tick, int(tick))
+
     def jump(self, at: float) -> None:
         """The world jumped at most a second ago: light may change at once around then."""
         self.jumps.update(range(int(at) - SECONDS_AROUND_A_JUMP, int(at) + SECONDS_AROUND_A_JUMP + 1))
@@ -80,9 +110,9 @@ class Recorder:
         """Pops that no jump of the world explains."""
         return sum(second.pops for number, second in self.seconds.items() if number not in self.jumps)
 
-    def latencies(self) -> list[float]:
-        """All of them [ms], in no order."""
-        return [value for second in self.seconds.values() for value in second.latency_ms]
+    def every(self, name: str) -> list[float]:
+        """All values of a list of ``Second`` [ms], in no order."""
+        return [value for second in self.seconds.values() for value in getattr(second, name)]
 
     def gained(self, *names: str) -> int | None:
         """By how much a counter of the server grew during the test."""
@@ -93,11 +123,6 @@ class Recorder:
         """What a member of the server's figures was at the end."""
         last = self._ends()[1]
         return None if last is None else last.number(*names)
-
-    def largest(self, *names: str) -> float | None:
-        """The largest that a member was during the test."""
-        values = [value for snapshot in self.live if (value := snapshot.number(*names)) is not None]
-        return max(values, default=None)
 
     def _ends(self) -> tuple[Live | None, Live | None]:
         return (self.live[0], self.live[-1]) if self.live else (None, None)
@@ -122,7 +147,7 @@ class Setting:
 def report_of(recorder: Recorder, setting: Setting, seconds: float, cpu_share: float, interrupted: bool) -> dict[str, Any]:
     """The report as JSON. Server figures that were not to be had are None."""
     offset = 0.0
-    latencies = recorder.latencies()
+    latencies = recorder.every("latency_ms")
     if setting.mode == "stream" and latencies and (not setting.same_clock or min(latencies) < 0):
         offset = min(latencies)  # two machines' clocks differ by more than a network takes: only the differences mean something
     total_bytes = recorder.total("bytes")
@@ -130,12 +155,10 @@ def report_of(recorder: Recorder, setting: Setting, seconds: float, cpu_share: f
     return {
         "players": setting.players,
         "seconds": round(seconds, 3),
-        "tick_ms": {
-            "p50": recorder.last("tick_ms", "p50"),
-            "p99": recorder.last("tick_ms", "p99"),
-            "max": recorder.largest("tick_ms", "max"),
-        },
+        "tick_ms": _summary(recorder.every("tick_ms")),
+        "lateness_ms": _summary(recorder.every("lateness_ms")),
         "late_ticks": recorder.gained("late_ticks"),
+        "skipped": recorder.gained("skipped"),
         "volume_ms": {f"p{n}": _shifted(percentile(latencies, n / 100), offset) for n in (50, 99)},
         "bytes_per_second_per_player": round(total_bytes / seconds / setting.players, 1) if seconds > 0 and setting.players else 0.0,
         "misses": recorder.gained("misses"),
@@ -164,6 +187,12 @@ def report_of(recorder: Recorder, setting: Setting, seconds: float, cpu_share: f
     }
 
 
+def _summary(values: Sequence[float]) -> dict[str, float | None]:
+    """p50, p99 and max [ms] of the whole test; None of nothing."""
+    shares = {"p50": 0.5, "p99": 0.99, "max": 1.0}
+    return {name: _shifted(percentile(values, share), 0.0) for name, share in shares.items()}
+
+
 def _shifted(value: float | None, offset: float) -> float | None:
     return None if value is None else round(value - offset, 3)
 
@@ -177,10 +206,15 @@ def _cache(recorder: Recorder) -> dict[str, int | None]:
 def _per_second(recorder: Recorder, setting: Setting, seconds: float, offset: float) -> list[dict[str, Any]]:
     """One object for each second that was whole."""
     rows = []
+    asked_at = [said.at for said in recorder.live]
+
+    def said_until(at: float) -> Live | None:
+        count = bisect_right(asked_at, at)
+        return recorder.live[count - 1] if count else None
+
     for number in range(int(seconds)):
         second = recorder.seconds.get(number, Second())
-        until = [snapshot for snapshot in recorder.live if snapshot.at <= number + 1]
-        before = [snapshot for snapshot in until if snapshot.at <= number]
+        before, until = said_until(number), said_until(number + 1)
         row: dict[str, Any] = {
             "volume_ms_p50": _shifted(percentile(second.latency_ms, 0.5), offset),
             "volume_ms_p99": _shifted(percentile(second.latency_ms, 0.99), offset),
@@ -190,10 +224,11 @@ def _per_second(recorder: Recorder, setting: Setting, seconds: float, offset: fl
             "errors": second.errors,
             "jump": number in recorder.jumps,
         }
-        for name in ("p50", "p99"):
-            row[f"tick_ms_{name}"] = until[-1].number("tick_ms", name) if until else None
-        for name in ("late_ticks", "misses"):
-            last, first = (ends[-1].number(name) if ends else None for ends in (until, before))
+        for name in ("tick_ms", "lateness_ms"):
+            row |= {f"{name}_{key}": value for key, value in _summary(getattr(second, name)).items() if key != "max"}
+        for name in ("late_ticks", "skipped", "misses"):
+            last, first = (None if said is None else said.number(name) for said in (until, before))
             row[name] = None if last is None or first is None else round(last - first)
+        row["memory_bytes"] = None if until is None else until.number("memory_bytes")
         rows.append(row)
     return rows

@@ -1,7 +1,8 @@
 """The WebSocket streams of players' volumes: a task for each client, woken by ticks, slowed down by whoever reads slowly.
 
 A task encodes the volume as it is when the last message has gone out, so that a slow reader gets fewer frames and never a queue of them:
-beyond the socket's own buffer a client costs one message, one more that is ready, and what the encoder remembers (1.2 MB).
+beyond the socket's own buffer a client costs one message, one more that is ready, and what the encoder remembers (1.2 MB). First frames
+take turns (first_frames.py), so that many who come at once do not hold up ticks.
 STREAM.md describes the messages and the codes that end a stream.
 """
 
@@ -17,6 +18,7 @@ from typing import Any, NamedTuple
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from gi_core.live_volume import PublishedVolume
+from server.first_frames import FirstFrames
 from server.stream_header import StreamHeader
 from server.tick_signal import Published, TickSignal
 from server.ticker import Ticker
@@ -64,6 +66,7 @@ class PlayerStreams:
     def __init__(self, ticks: TickSignal) -> None:
         self.counts = StreamCounts()
         self._ticks = ticks
+        self._first_frames = FirstFrames(ticks)
         self._closing: set[asyncio.Future[Close]] = set()
         self._ended = asyncio.Event()
         self._is_closed = False
@@ -88,7 +91,7 @@ class PlayerStreams:
             told: asyncio.Future[Close] = asyncio.get_running_loop().create_future()
             self._closing.add(told)
             try:
-                stream = _Stream(socket, ticker, player, self._ticks, self._encoders, self.counts)
+                stream = _Stream(socket, ticker, player, self._ticks, self._first_frames, self._encoders, self.counts)
                 ending = await first_of(stream.send(), stream.listen(), _result(told))
                 if ending is not None:
                     await close(socket, ending)
@@ -117,10 +120,17 @@ class _Stream:
     """One client's."""
 
     def __init__(
-        self, socket: WebSocket, ticker: Ticker, player: str, ticks: TickSignal, encoders: ThreadPoolExecutor, counts: StreamCounts
+        self,
+        socket: WebSocket,
+        ticker: Ticker,
+        player: str,
+        ticks: TickSignal,
+        first_frames: FirstFrames,
+        encoders: ThreadPoolExecutor,
+        counts: StreamCounts,
     ) -> None:
         self._socket, self._ticker, self._player = socket, ticker, player
-        self._ticks, self._encoders, self._counts = ticks, encoders, counts
+        self._ticks, self._first_frames, self._encoders, self._counts = ticks, first_frames, encoders, counts
         self._wants_full = False
 
     async def send(self) -> Close | None:
@@ -140,6 +150,10 @@ class _Stream:
             if volume is seen and not self._wants_full:
                 _encode(encoder, now, volume)  # costs nothing, but the encoder counts the ticks it looked at
                 continue
+            if seen is None:
+                await self._first_frames.turn()
+                # Meanwhile there were ticks, and perhaps a later volume.
+                now, volume = self._ticks.latest, self._ticker.world.published(self._player) or volume
             if self._wants_full:
                 self._wants_full = False
                 encoder.forget()

@@ -2,7 +2,9 @@
 
 from bisect import bisect_left
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,6 +13,14 @@ from gi_core.live_world import TickReport
 WINDOW = 1800  # a minute at 30 Hz
 # Upper ends of a histogram's buckets [s]: from a tick that does nothing to one that takes all of the slowest rate's time.
 BUCKETS_S = (0.0005, 0.001, 0.002, 0.004, 0.008, 0.016, 0.033, 0.066, 0.25, 1.0)
+
+
+class TickTime(NamedTuple):
+    """A tick, how long it took [ms], and how long after it was due it began [ms]."""
+
+    tick: int
+    ms: float
+    lateness_ms: float
 
 
 @dataclass(eq=False)
@@ -33,8 +43,7 @@ class TickStats:
     loads: int = 0
     evictions: int = 0
     failed_ticks: int = 0
-    recent_ms: deque[float] = field(default_factory=lambda: deque(maxlen=WINDOW))
-    recent_lateness_ms: deque[float] = field(default_factory=lambda: deque(maxlen=WINDOW))
+    recent: deque[TickTime] = field(default_factory=lambda: deque(maxlen=WINDOW))
     parts_ms: dict[str, deque[float]] = field(default_factory=dict)
     waiting: int = 0
     bucket_counts: list[int] = field(default_factory=lambda: [0] * (len(BUCKETS_S) + 1))
@@ -53,17 +62,26 @@ class TickStats:
         self.waiting = report.waiting
         self.bucket_counts[bisect_left(BUCKETS_S, took_ms / 1e3)] += 1
         self.seconds += took_ms / 1e3
-        self.recent_ms.append(took_ms)
-        self.recent_lateness_ms.append(lateness_ms)
+        self.recent.append(TickTime(report.tick, took_ms, lateness_ms))
         for name, value in report.ms.items():
             self.parts_ms.setdefault(name, deque(maxlen=WINDOW)).append(value)
 
-    def percentiles(self) -> dict[str, float]:
-        """p50, p99 and max of the last minute's ticks [ms]; zeros before the first."""
-        return percentiles(self.recent_ms)
+    @property
+    def tick_ms(self) -> dict[str, float]:
+        """p50, p99 and max of what the last minute's ticks took [ms]; zeros before the first."""
+        return percentiles(time.ms for time in list(self.recent))
+
+    @property
+    def lateness_ms(self) -> dict[str, float]:
+        """The same of how late they began [ms]."""
+        return percentiles(time.lateness_ms for time in list(self.recent))
+
+    def later_than(self, tick: int) -> list[TickTime]:
+        """The ticks of the last minute that came after one, in their order."""
+        return [time for time in list(self.recent) if time.tick > tick]
 
 
-def percentiles(values: "deque[float]") -> dict[str, float]:
+def percentiles(values: Iterable[float]) -> dict[str, float]:
     """p50, p99 and max; zeros of nothing."""
     found = np.array(list(values) or [0.0])
     p50, p99 = np.percentile(found, [50, 99]).tolist()

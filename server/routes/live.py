@@ -7,20 +7,25 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Query
 
-from server.dependencies import NoQuery, ServiceDep
+from server.dependencies import LiveQuery, ServiceDep
 from server.live_access import TickerDep
 from server.live_models import LiveReply
 from server.service import Service
-from server.tick_stats import percentiles
+from server.tick_stats import TickTime, percentiles
 from server.ticker import Ticker
 
 router = APIRouter(prefix="/v1", tags=["live world"])
 
 
 @router.get("/live", response_model=LiveReply)
-def live(service: ServiceDep, ticker: TickerDep, _: Annotated[NoQuery, Query()]) -> dict[str, Any]:
-    """How ticks go (percentiles of the last minute, counts since the start), what is resident, and what failed."""
-    return live_facts(service, ticker)
+def live(service: ServiceDep, ticker: TickerDep, query: Annotated[LiveQuery, Query()]) -> dict[str, Any]:
+    """How ticks go (percentiles of the last minute, counts since the start), what is resident, and what failed.
+
+    With `since`, also each tick by itself: who asks once in a while, with the last tick that it was told of, misses none.
+    """
+    times = [] if query.since is None else ticker.stats.later_than(query.since)
+    each = None if query.since is None else {name: [getattr(time, name) for time in times] for name in TickTime._fields}
+    return {**live_facts(service, ticker), "recent": each}
 
 
 def live_facts(service: Service, ticker: Ticker) -> dict[str, Any]:
@@ -30,9 +35,9 @@ def live_facts(service: Service, ticker: Ticker) -> dict[str, Any]:
     return {
         "tick": ticker.tick,
         "tick_rate": ticker.rate_hz,
-        "tick_ms": stats.percentiles(),
+        "tick_ms": stats.tick_ms,
         "parts_ms": {name: percentiles(values) for name, values in dict(stats.parts_ms).items()},
-        "lateness_ms": percentiles(stats.recent_lateness_ms),
+        "lateness_ms": stats.lateness_ms,
         "late_ticks": stats.late_ticks,
         "skipped": stats.skipped,
         "ticks": stats.ticks,

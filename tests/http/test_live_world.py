@@ -261,6 +261,24 @@ def test_live_says_how_ticks_go(live_http: httpx.Client, player: str) -> None:
     assert later["memory_bytes"] > 1 << 20
 
 
+def test_live_tells_of_each_tick_to_who_asks_again(live_http: httpx.Client, player: str) -> None:
+    known = live_http.get("/v1/live").json()["tick"] - 1
+    told: list[int] = []
+    while len(told) < 20:
+        recent = live_http.get("/v1/live", params={"since": told[-1] if told else known}).json()["recent"]
+        assert len(recent["tick"]) == len(recent["ms"]) == len(recent["lateness_ms"])
+        assert all(ms > 0 for ms in recent["ms"])
+        assert all(ms >= 0 for ms in recent["lateness_ms"])
+        told += recent["tick"]
+        time.sleep(0.12)
+    assert told[0] > known
+    assert told == sorted(set(told))
+    live = live_http.get("/v1/live", params={"since": told[0] - 1}).json()
+    assert live["recent"]["tick"][: len(told)] == told  # none was left out between two answers
+    assert live_http.get("/v1/live").json()["recent"] is None
+    assert live_http.get("/v1/live", params={"since": -2}).status_code == 400
+
+
 def test_metrics_say_the_same(live_http: httpx.Client, player: str) -> None:
     live_http.get(f"/v1/players/{player}/volume")
     live_http.get("/v1/players/nobody")

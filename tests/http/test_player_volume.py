@@ -75,13 +75,34 @@ def test_many_readers_cost_one_encoding(live_http: httpx.Client, settled: str) -
     assert encoded() == before + 1
 
 
+def timing(reply: httpx.Response) -> dict[str, float]:
+    """The parts of a reply's Server-Timing [ms], in their order."""
+    parts = [part.partition(";dur=") for part in reply.headers["server-timing"].split(", ")]
+    return {name: float(value) for name, _, value in parts}
+
+
 def test_what_took_how_long_is_told_where_something_was_computed(live_http: httpx.Client, settled: str) -> None:
-    assert "encode;dur=" in live_http.get(f"/v1/players/{settled}/volume").headers["server-timing"]
+    assert list(timing(live_http.get(f"/v1/players/{settled}/volume"))) == ["wait", "encode", "total"]
     query = {"time": "12:34", "weather": "fog:0.123", "x": 32, "y": 5, "z": 32}
     first = live_http.get("/v1/volume", params=query)
-    names = [part.partition(";dur=")[0] for part in first.headers["server-timing"].split(", ")]
-    assert names == ["light", "relight", "encode"]
-    again = live_http.get("/v1/volume", params=query)
-    assert again.content == first.content
-    assert "server-timing" not in again.headers
-    assert "compute;dur=" in live_http.get("/v1/lighting", params={"time": "12:34", "weather": "fog:0.321"}).headers["server-timing"]
+    parts = timing(first)
+    assert list(parts) == ["light", "relight", "encode", "total"]
+    assert 0 < sum(parts.values()) - parts["total"] <= parts["total"]
+    again = [live_http.get("/v1/volume", params=query) for _ in range(2)]
+    # The second answer to be given from the same reply must not have the first one's line as well.
+    assert all(reply.content == first.content and list(timing(reply)) == ["total"] for reply in again)
+    assert list(timing(live_http.get("/v1/lighting", params={"time": "12:34", "weather": "fog:0.321"}))) == ["compute", "total"]
+
+
+def test_every_reply_tells_its_total(live_http: httpx.Client, settled: str) -> None:
+    paths = ["/", "/healthz", "/metrics", "/v1/world", "/v1/clock", "/v1/weather", "/v1/settings", "/v1/lights", "/v1/players", "/v1/live"]
+    for path in (*paths, f"/v1/players/{settled}", "/v1/players/nobody", "/nowhere", "/v1/volume?x=a"):
+        assert timing(live_http.get(path))["total"] >= 0, path
+    etag = live_http.get("/v1/world").headers["etag"]
+    for reply in (
+        live_http.get("/v1/world", headers={"If-None-Match": etag}),
+        live_http.head("/v1/clock"),
+        live_http.put("/v1/clock", json={}),
+        live_http.post("/v1/players", json={"id": settled}),
+    ):
+        assert timing(reply)["total"] > 0, reply.request

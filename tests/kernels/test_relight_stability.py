@@ -105,7 +105,8 @@ def test_with_all_gains_and_colours_at_their_maximum_ticks_never_grow(make_secto
     live = LiveSector(device, sector, PATCHES, ShadowGeometry({}.__getitem__, []), Lock())
     shown, kept = np.zeros((2, sector.probe_count, 6, 4), np.float32)
     for tick in range(ticks):
-        live.relight(relighter, light, 1)
+        live.light(light)
+        relighter.relight([live.resident], light.given)
         live.measure()
         live.advance(tick, changed=True, is_read=True)
         device.read(live.shown(panel, lambda: np.full((6, 3), MAX_AMBIENT_LX, np.float32), "cube"), shown)

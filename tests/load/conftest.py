@@ -32,9 +32,10 @@ SLAB_TICKS = 10  # the volume moves by one voxel this often
 
 @dataclass
 class Behaviour:
-    """What a stand-in does wrong, from tick ``since`` on: every ``every`` ticks."""
+    """What a stand-in does wrong, from tick ``since`` on and before tick ``until``: every ``every`` ticks."""
 
     since: int = 20
+    until: int = 1 << 31
     every: int = 20
     pops: bool = False
     drops_frames: bool = False
@@ -42,6 +43,8 @@ class Behaviour:
     closes: bool = False
     clock_jumps: bool = False
     is_late: bool = False
+    skips: bool = False
+    grows: bool = False
     misses: bool = False
     fails_volumes: bool = False
     has_no_live: bool = False
@@ -49,7 +52,7 @@ class Behaviour:
 
     def strikes(self, tick: int) -> bool:
         """Whether this is a tick at which things go wrong."""
-        return tick >= self.since and tick % self.every == 0
+        return self.since <= tick < self.until and tick % self.every == 0
 
 
 @dataclass
@@ -95,25 +98,39 @@ class StandIn:
             return JSONResponse({"status": 401}, 401)
         return Response(status_code=204 if self.players.pop(request.path_params["id"], None) else 404)
 
-    async def live(self, _: Request) -> Response:
+    def took_ms(self, tick: int) -> float:
+        if self.behaviour.is_late and self.behaviour.strikes(tick):
+            return 50.0
+        return 3.0 if tick % 10 == 0 else 1.5
+
+    async def live(self, request: Request) -> Response:
         if self.behaviour.has_no_live:
             return JSONResponse({"status": 404}, 404)
         tick = self.tick
         wrong = self.strikes_until(tick)
+        recent = None
+        if "since" in request.query_params:
+            later = range(int(request.query_params["since"]) + 1, tick)  # the last one is under way
+            took_ms = [self.took_ms(t) for t in later]
+            recent = {"tick": list(later), "ms": took_ms, "lateness_ms": [max(ms - 1000 / HEADER.tick_rate, 0.25) for ms in took_ms]}
         return JSONResponse(
             {
+                "recent": recent,
                 "tick": tick,
                 "tick_rate": HEADER.tick_rate,
-                "tick_ms": {"p50": 1.5, "p99": 40.0 if self.behaviour.is_late else 3.0, "max": 50.0 if self.behaviour.is_late else 5.0},
+                # Of the last minute: nothing to tell a whole test by.
+                "tick_ms": {"p50": 99.0, "p99": 99.0, "max": 99.0},
+                "lateness_ms": {"p50": 99.0, "p99": 99.0, "max": 99.0},
                 "late_ticks": 7 + wrong * self.behaviour.is_late,
+                "skipped": 2 + wrong * self.behaviour.skips,
                 "ticks": tick,
                 "misses": 3 + wrong * self.behaviour.misses,
                 "resident_sectors": 9,
                 "resident_bytes": 9_000_000,
                 "relit": 2 * tick,
                 "players": len(self.players),
-                "memory_bytes": 150_000_000,
-                "cache": {"hits": 5 * tick, "misses": 2},
+                "memory_bytes": 150_000_000 + 1_000_000 * wrong * self.behaviour.grows,
+                "cache": {"hits": 5 * tick, "misses": 2, "player_volume_hits": 3 * tick, "player_volume_misses": 8 * tick},
             }
         )
 

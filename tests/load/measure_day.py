@@ -26,7 +26,6 @@ from server.live import Live, LiveOptions
 from server.live_weather import scripted_weather
 from server.players import Player
 from server.routes.live import memory_bytes
-from server.tick_stats import percentiles
 
 
 def luminance(values: np.ndarray) -> np.ndarray:
@@ -107,7 +106,7 @@ def main() -> int:
         "late_share": (stats.late_ticks - first_late) / ticks,
         "skipped": stats.skipped - first_skipped,
         "misses": stats.misses,
-        "tick_ms_last_minute": percentiles(stats.recent_ms),
+        "tick_ms_last_minute": stats.tick_ms,
         "memory_mb": memory,
         "staleness_median": float(np.median([c["median"] for c in checks])) if checks else None,
         "staleness_p95_median": float(np.median([c["p95"] for c in checks])) if checks else None,

@@ -35,14 +35,17 @@ def test_a_server_that_behaves(standing_in: StandingIn, mode: str) -> None:
     assert set(report) >= CONTRACT
     assert report["players"] == 3
     assert report["seconds"] == pytest.approx(1.7, abs=1.0)
-    assert (report["errors"], report["misses"], report["late_ticks"], report["pops"]) == (0, 0, 0, 0), report["error_messages"]
-    assert report["tick_ms"] == {"p50": 1.5, "p99": 3.0, "max": 5.0}
+    mishaps = [report[name] for name in ("errors", "misses", "late_ticks", "skipped", "pops", "memory_bytes_gained")]
+    assert mishaps == [0] * 6, report["error_messages"]
+    assert report["tick_ms"] == {"p50": 1.5, "p99": 3.0, "max": 3.0}
+    assert report["lateness_ms"] == {"p50": 0.25, "p99": 0.25, "max": 0.25}
     assert report["ticks"] == pytest.approx(30 * report["seconds"], abs=30)
     assert report["cache"]["hits"] == 5 * report["ticks"]
     assert report["memory_bytes"] == 150_000_000
     assert 0 <= report["volume_ms"]["p50"] <= report["volume_ms"]["p99"] < 5000
     assert report["bytes_per_second_per_player"] > 0
     assert len(report["per_second"]) == int(report["seconds"])
+    assert [row["memory_bytes"] for row in report["per_second"]] == [150_000_000] * len(report["per_second"])
     if mode == "stream":
         # A full frame at first, then a slab every SLAB_TICKS, and nothing else.
         assert report["full_frames"] == 3
@@ -104,17 +107,37 @@ def test_errors_are_counted_and_the_test_goes_on(standing_in: StandingIn, fault:
     assert report["frames"] > 2  # more than the first of each player
 
 
-def test_late_ticks_and_misses_are_what_the_server_gained(standing_in: StandingIn) -> None:
-    with standing_in(is_late=True, misses=True, since=0, every=10) as (_, url):
+def test_late_and_skipped_ticks_misses_and_memory_are_what_the_server_gained(standing_in: StandingIn) -> None:
+    with standing_in(is_late=True, misses=True, skips=True, grows=True, since=0, every=10) as (_, url):
         report = measure(url)
-    assert 4 <= report["late_ticks"] == report["misses"] <= 12
+    assert 4 <= report["late_ticks"] == report["misses"] == report["skipped"] <= 12
+    assert report["memory_bytes_gained"] == 1_000_000 * report["late_ticks"]
+    assert report["tick_ms"] == {"p50": 1.5, "p99": 50.0, "max": 50.0}
+    assert report["lateness_ms"]["p99"] == pytest.approx(50 - 1000 / 30, abs=0.001)
+
+
+def test_percentiles_are_of_each_tick_of_the_whole_test(standing_in: StandingIn) -> None:
+    """Late at the beginning and never again: whoever asks in the end how the last ticks went does not hear of it."""
+    seen: list[Any] = []
+    with standing_in(is_late=True, since=0, every=1, until=45) as (world, url):
+        options = Options(url, players=1, seconds=3.7)
+        report = run(options, lambda at, recorder: seen.append(recorder))
+        assert world.tick > 45
+    ticks = len(seen[0].every("tick_ms"))
+    # Ticks in order and none twice; the one that is under way when the server is asked is told of the next time.
+    assert ticks == pytest.approx(report["ticks"], abs=1)
     assert report["tick_ms"]["max"] == 50.0
+    assert 50.0 in seen[0].seconds[0].tick_ms
+    assert max(seen[0].seconds[3].tick_ms) == 3.0
+    assert report["per_second"][0]["tick_ms_p99"] == 50.0
+    assert report["per_second"][2]["tick_ms_p99"] == 3.0
 
 
 def test_a_server_without_live_figures(standing_in: StandingIn) -> None:
     with standing_in(has_no_live=True) as (_, url):
         report = measure(url)
-    assert report["tick_ms"] == {"p50": None, "p99": None, "max": None}
+    assert report["tick_ms"] == report["lateness_ms"] == {"p50": None, "p99": None, "max": None}
+    assert report["skipped"] is None
     assert report["misses"] is None
     assert report["errors"] > 0
     assert report["frames"] > 0
@@ -140,21 +163,26 @@ def test_paths_speed_and_token_reach_the_server(standing_in: StandingIn, tmp_pat
 
 def test_files_thresholds_and_exit_status(standing_in: StandingIn, tmp_path: Path) -> None:
     out, plot = tmp_path / "out.json", tmp_path / "out.png"
-    with standing_in(is_late=True, since=0, every=10) as (_, url):
+    with standing_in(is_late=True, skips=True, grows=True, since=0, every=10) as (_, url):
         limits = ["--max-tick-p99-ms", "4", "--max-late-share", "0.01", "--max-misses", "0", "--max-errors", "0", "--max-megabits", "24"]
+        limits += ["--max-lateness-p99-ms", "1", "--max-skipped", "0", "--max-cache-miss-share", "0.9", "--max-memory-gained-mb", "0.5"]
         command = [*COMMAND, url, "--seconds", "1.2", "--json", str(out), "--plot", str(plot), *limits]
         done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=60)
     assert done.returncode == 1
     lines = [line for line in done.stderr.splitlines() if line.startswith("sectorlight: ")]
-    assert len(lines) == 2
-    assert "--max-tick-p99-ms 4" in lines[0]
-    assert "40" in lines[0]
-    assert "--max-late-share 0.01" in lines[1]
+    assert [line.split(":")[1].strip() for line in lines] == [
+        "--max-tick-p99-ms 4",
+        "--max-lateness-p99-ms 1",
+        "--max-late-share 0.01",
+        "--max-skipped 0",
+        "--max-memory-gained-mb 0.5",
+    ]
+    assert lines[0].endswith("was 50")
     assert set(json.loads(out.read_text())) >= CONTRACT
     with Image.open(plot) as picture:
         picture.load()
         assert len(picture.getcolors(1 << 20)) > 4
-    assert "tick p50" in done.stdout
+    assert all(name in done.stdout for name in ("tick p50", "lateness p50", "skipped", "cache hits"))
 
 
 def test_ctrl_c_deletes_the_players_and_still_reports(standing_in: StandingIn, tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """The load test's arithmetic, files and picture, without a server."""
 
 import json
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -17,17 +18,23 @@ from server.loadtest_plot import _round_up, draw
 from server.loadtest_record import Live, Recorder, Setting, percentile, report_of
 from server.stream_header import StreamError
 
+CACHE = {"hits": 7, "misses": 3, "player_volume_hits": 0, "player_volume_misses": 0}
 SETTING = Setting(players=2, mode="stream", speed=5.0, pop_bound=0.2, same_clock=True)
 
 
 def some_report(setting: Setting = SETTING, latencies: tuple[float, ...] = (4.0, 6.0, 30.0)) -> dict[str, Any]:
+    def said(at: float, tick: int, recent: list[int], **members: Any) -> Live:
+        times = {"tick": recent, "ms": [2.0 + 88.0 * (n == 110) for n in recent], "lateness_ms": [0.5 * n for n in recent]}
+        return Live(at, {"tick": tick, "tick_rate": 30, "recent": times, "late_ticks": 5, "ticks": 100, "misses": 1, **members})
+
     recorder = Recorder()
-    recorder.live.append(Live(0.0, {"late_ticks": 5, "ticks": 100, "misses": 1, "tick_ms": {"p50": 1, "p99": 2, "max": 90}}))
+    recorder.server(said(0.0, 100, [], memory_bytes=4, skipped=1, cache=dict.fromkeys(CACHE, 0)))
+    recorder.server(said(1.2, 136, list(range(100, 136)), memory_bytes=6, skipped=3, cache=CACHE))
     for number, latency in enumerate(latencies):
         recorder.message(number + 0.5, 1000, latency)
     recorder.pops(0.5, 3)
     recorder.error(1.5, "x")
-    recorder.live.append(Live(3.0, {"late_ticks": 8, "ticks": 190, "misses": 1, "tick_ms": {"p50": 1.5, "p99": 3, "max": 4}}))
+    recorder.server(said(3.0, 190, list(range(136, 190)), late_ticks=8, ticks=190, memory_bytes=5, skipped=3, cache=CACHE))
     return report_of(recorder, setting, 3.0, 0.5, False)
 
 
@@ -35,7 +42,15 @@ def test_a_report_sums_up() -> None:
     report = some_report()
     assert report["bytes_per_second_per_player"] == 500
     assert report["volume_ms"] == {"p50": 6.0, "p99": 30.0}
-    assert report["tick_ms"] == {"p50": 1.5, "p99": 3, "max": 90}
+    # 90 ticks, of which one is no percent.
+    assert report["tick_ms"] == {"p50": 2.0, "p99": 90.0, "max": 90.0}
+    assert report["lateness_ms"] == {"p50": 72.0, "p99": 94.5, "max": 94.5}
+    # Each tick in its own second, whenever the server was asked.
+    assert [row["tick_ms_p99"] for row in report["per_second"]] == [90.0, 2.0, 2.0]
+    assert [row["lateness_ms_p99"] for row in report["per_second"]] == [64.5, 79.5, 94.5]
+    assert [row["memory_bytes"] for row in report["per_second"]] == [4, 6, 5]
+    assert [row["skipped"] for row in report["per_second"]] == [0, 2, 0]
+    assert (report["skipped"], report["memory_bytes_gained"], report["cache"]["hits"]) == (2, 1, 7)
     assert (report["late_ticks"], report["ticks"], report["misses"], report["pops"], report["errors"]) == (3, 90, 0, 3, 1)
     assert [row["bytes_per_player"] for row in report["per_second"]] == [500, 500, 500]
     assert [row["errors"] for row in report["per_second"]] == [0, 1, 0]
@@ -78,21 +93,15 @@ def test_only_great_changes_in_free_air_pop() -> None:
 
 def test_limits_name_what_was_missed() -> None:
     report = some_report()
-    assert (
-        list(missed(report, Limits(tick_p99_ms=3, late_share=3 / 90, volume_p99_ms=30, megabits=0.004, misses=0, pops=3, errors=1))) == []
-    )
-    lines = list(missed(report, Limits(tick_p99_ms=2.9, late_share=0.03, volume_p99_ms=29, megabits=0.003, misses=0, pops=2, errors=0)))
-    assert [line.split()[0] for line in lines] == [
-        "--max-tick-p99-ms",
-        "--max-late-share",
-        "--max-volume-p99-ms",
-        "--max-megabits",
-        "--max-pops",
-        "--max-errors",
-    ]
+    held = {"tick_p99_ms": 90.0, "lateness_p99_ms": 94.5, "late_share": 3 / 90, "skipped": 2, "volume_p99_ms": 30.0, "megabits": 0.004}
+    held |= {"misses": 0, "pops": 3, "errors": 1, "cache_miss_share": 0.3, "memory_gained_mb": 1e-6}
+    assert set(held) == {member.name for member in fields(Limits)}
+    assert list(missed(report, Limits(**held))) == []
+    lines = list(missed(report, Limits(**{name: bound - 1e-7 for name, bound in held.items()})))
+    assert [line.split()[0] for line in lines] == [f"--max-{name.replace('_', '-')}" for name in held]
     unknown = report_of(Recorder(), SETTING, 3.0, 0.5, False)
-    assert all("not known" in line for line in missed(unknown, Limits(tick_p99_ms=1, late_share=1, misses=0)))
-    assert len(list(missed(unknown, Limits(tick_p99_ms=1, late_share=1, misses=0)))) == 3
+    lines = [line for line in missed(unknown, Limits(**held)) if "not known" in line]
+    assert len(lines) == len(held) - len(["megabits", "pops", "errors"])  # which the clients count
 
 
 def test_units_in_brackets_are_shown(capsys: pytest.CaptureFixture[str]) -> None:
@@ -105,7 +114,7 @@ def test_units_in_brackets_are_shown(capsys: pytest.CaptureFixture[str]) -> None
 
 def test_a_picture_and_a_table_of_any_report() -> None:
     for report in (some_report(), report_of(Recorder(), SETTING, 0.2, 0.95, True)):
-        assert draw(report).size == (900, 760)
+        assert draw(report).size == (900, 940)
         assert table_of(report).row_count >= 10
 
 

@@ -195,6 +195,6 @@ def test_the_token_is_never_committed_nor_copied():
 def test_linters_find_nothing(command):
     linter = shutil.which(command[0], path=str(Path(sys.executable).parent))
     if linter is None:
-        pytest.skip(f"{command[0]} is not installed: make lint-docker installs it")
+        pytest.skip(f"{command[0]} is not installed: make test-all installs it")
     done = subprocess.run([linter, *command[1:]], check=False, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stdout + done.stderr
