@@ -18,7 +18,17 @@ from gi_core.layout import SHADOW_TRIANGLE
 from gi_core.live_sector import LiveSector
 from gi_core.relight_input import RelightInput
 from gi_core.shadow_map import ShadowMap
-from gi_core.shadow_plan import MAP_TEXELS, TEXELS_PER_METRE, MovingBox, ShadowPlan, caster_records, plan_map, sun_or_box_moved
+from gi_core.shadow_plan import (
+    MAP_TEXELS,
+    NO_BOXES,
+    TEXELS_PER_METRE,
+    MovingBox,
+    ShadowPlan,
+    box_corners,
+    caster_records,
+    plan_map,
+    sun_or_box_moved,
+)
 from gi_core.volume import plan_boxes
 
 log = logging.getLogger("sectorlight.shadows")
@@ -55,6 +65,8 @@ class LiveShadows:
         self._turn = 0
         self._to_sample: list[SectorIndex] = []
         self._dark = True
+        self._boxes: tuple[Sequence[MovingBox], Float64] = (), NO_BOXES
+        """The boxes of the last tick, and their corners."""
 
     @property
     def nbytes(self) -> int:
@@ -96,10 +108,12 @@ class LiveShadows:
                 if plan is not None:
                     self._map.begin(plan)
         elif len(positions):
-            self._plan(positions, np.asarray(given.lights["direction"][0, :3], np.float64), boxes, residents)
+            if boxes is not self._boxes[0]:
+                self._boxes = boxes, box_corners(boxes)
+            self._plan(positions, np.asarray(given.lights["direction"][0, :3], np.float64), self._boxes[1], residents)
         return ()
 
-    def _plan(self, positions: Float64, to_sun: Float64, boxes: Sequence[MovingBox], residents: Mapping[SectorIndex, LiveSector]) -> None:
+    def _plan(self, positions: Float64, to_sun: Float64, boxes: Float64, residents: Mapping[SectorIndex, LiveSector]) -> None:
         """Plan a map for the next player, in turn, whose volume reads a sector that lacks samples."""
         count = len(positions)
         for offset in range(min(count, PLAYERS_LOOKED_AT_PER_TICK)):
@@ -108,7 +122,7 @@ class LiveShadows:
             here = [index for index in touched if index in residents]
             if any(lacks_samples(residents[index], to_sun, boxes) for index in here):
                 self._turn = player + 1
-                self._planning = self._planner.submit(self._prepare, positions[player].copy(), to_sun, tuple(boxes))
+                self._planning = self._planner.submit(self._prepare, positions[player].copy(), to_sun, boxes)
                 return
         self._turn += PLAYERS_LOOKED_AT_PER_TICK
 
@@ -126,7 +140,7 @@ class LiveShadows:
         """Stop planning."""
         self._planner.shutdown(cancel_futures=True)
 
-    def _prepare(self, position: Float64, to_sun: Float64, boxes: tuple[MovingBox, ...]) -> tuple[ShadowPlan | None, Casters]:
+    def _prepare(self, position: Float64, to_sun: Float64, boxes: Float64) -> tuple[ShadowPlan | None, Casters]:
         """In the planner's thread: a map, and the triangles that it draws."""
         plan = plan_map(position, to_sun, self._known, *self._heights, boxes)
         if plan is None:
@@ -150,7 +164,7 @@ class LiveShadows:
         return self._to_draw[index]
 
 
-def lacks_samples(sector: LiveSector, to_sun: Float64, boxes: Sequence[MovingBox]) -> bool:
+def lacks_samples(sector: LiveSector, to_sun: Float64, boxes: Float64) -> bool:
     """Whether a sector that a volume reads has no samples, or old ones: the sun or a box has moved since."""
     of = sector.sampled_of
     return of is None or sun_or_box_moved(of, to_sun, boxes)

@@ -17,7 +17,7 @@ from gi_core.grid import SectorIndex
 from gi_core.layout import NO_SAMPLE, SHADOW_ROW_TEXELS
 from gi_core.resident_sector import SURFELS_PER_GROUP, ResidentSector
 from gi_core.sector import counts
-from gi_core.shadow_plan import MAP_TEXELS, ShadowPlan, box_corners, oldest_fresh, triangle_records
+from gi_core.shadow_plan import MAP_TEXELS, ShadowPlan, box_triangles, oldest_fresh, triangle_records
 
 NOTHING_DRAWN = np.float32(-1e30)  # as in shadow_map.h
 # Each work-item looks at every triangle. A CPU wants few of them, though more than cores; a GPU wants many.
@@ -125,9 +125,9 @@ class ShadowMap:
             drawn += count
         if self._left:
             return False
-        if plan.boxes:
-            corners = np.concatenate([box_corners(box) for box in plan.boxes]) - plan.middle
-            self._enqueue(plan, plan.middle, self._device.upload(triangle_records(corners)), len(corners))
+        if len(plan.boxes):
+            triangles = box_triangles(plan.boxes - plan.middle)
+            self._enqueue(plan, plan.middle, self._device.upload(triangle_records(triangles)), len(triangles))
         self._front, self._back = self._back, self._front
         self.plan, self._drawing = plan, None
         if self.number == LAST_NUMBER:
