@@ -20,6 +20,7 @@ from gi_core.live_sector import FADE_TICKS, LiveLight
 from gi_core.live_volumes import HELD_TICKS
 from gi_core.live_world import LiveWorld, TickPlayers, TickReport
 from gi_core.relight_input import relight_input
+from gi_core.resident_sector import ResidentSector
 from gi_core.settings import NEUTRAL, Settings
 from gi_core.stream import device_bytes
 from gi_core.stream_plan import StreamOptions
@@ -322,6 +323,22 @@ def test_warming_up_changes_no_light(world, engine):
     lighting = engine.lighting("12:00", "clear")
     found = Run(world).settle(at(STREET), light_of(world, lighting))
     np.testing.assert_array_equal(found, engine.volume(STREET, lighting).values)
+
+
+def test_warming_up_reads_no_voxel_beyond_the_sector(world, monkeypatch):
+    read = []
+
+    def fill(sector, box, size, *_):
+        level = [0, 2]  # heights are clamped
+        first = box["sector_first"][0, level]
+        read.append((first, first + box["box_size"][0, level], box["sector_size"][0, level]))
+
+    monkeypatch.setattr(ResidentSector, "fill_volume", fill)
+    world.warm_up()
+    assert read
+    for first, end, count in read:
+        assert (first >= 0).all()
+        assert (end <= count).all()
 
 
 def test_a_shadow_map_is_drawn_around_players_and_used(engine):
