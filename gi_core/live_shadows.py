@@ -15,8 +15,7 @@ from gi_core.device import Device
 from gi_core.errors import SectorlightError
 from gi_core.grid import SectorIndex, volume_first_voxel
 from gi_core.layout import SHADOW_TRIANGLE
-from gi_core.live_sector import LiveSector
-from gi_core.relight_input import RelightInput
+from gi_core.live_sector import LiveLight, LiveSector
 from gi_core.shadow_map import ShadowMap
 from gi_core.shadow_plan import (
     MAP_TEXELS,
@@ -26,6 +25,7 @@ from gi_core.shadow_plan import (
     ShadowPlan,
     box_corners,
     caster_records,
+    is_near,
     plan_map,
     sun_or_box_moved,
 )
@@ -76,13 +76,12 @@ class LiveShadows:
     def step(
         self,
         positions: Float64,
-        given: RelightInput,
-        sun_is_up: bool,
+        light: LiveLight,
         boxes: Sequence[MovingBox],
         residents: Mapping[SectorIndex, LiveSector],
     ) -> tuple[SectorIndex, ...]:
         """One tick's share of planning, drawing and sampling, for players at positions (p, 3) [m]; sectors whose sun that changes."""
-        if not sun_is_up:
+        if not light.sun_is_up:
             if self._dark:
                 return ()
             self._planning, self._to_sample, self._dark = None, [], True
@@ -91,26 +90,29 @@ class LiveShadows:
             return tuple(residents)
         self._dark = False
         plan = self._map.plan
-        if self._to_sample and plan is not None:
+        if self._to_sample and plan is not None and is_near(plan.to_sun, light.to_sun):
             some = self._to_sample[:SECTORS_SAMPLED_PER_TICK]
             del self._to_sample[:SECTORS_SAMPLED_PER_TICK]
             chosen = tuple(index for index in some if index in residents and wants_samples(residents[index], index, plan))
             for index in chosen:
                 residents[index].sample_sun(self._map)
             return chosen
-        if self._map.is_drawing:
+        # A map for a sun that has moved away, as it does when the clock jumps, is given up for another.
+        drawing = self._map.drawing
+        if drawing is not None and is_near(drawing.to_sun, light.to_sun):
             if self._map.draw(TRIANGLES_PER_TICK):
                 self._to_sample = list(covered(self._map.plan, residents))
         elif self._planning is not None:
             if self._planning.done():
-                plan, self._to_draw = self._planning.result()
+                plan, casters = self._planning.result()
                 self._planning = None
-                if plan is not None:
+                if plan is not None and is_near(plan.to_sun, light.to_sun):
+                    self._to_draw = casters
                     self._map.begin(plan)
         elif len(positions):
             if boxes is not self._boxes[0]:
                 self._boxes = boxes, box_corners(boxes)
-            self._plan(positions, np.asarray(given.lights["direction"][0, :3], np.float64), self._boxes[1], residents)
+            self._plan(positions, light.to_sun, self._boxes[1], residents)
         return ()
 
     def _plan(self, positions: Float64, to_sun: Float64, boxes: Float64, residents: Mapping[SectorIndex, LiveSector]) -> None:
@@ -175,13 +177,7 @@ def wants_samples(sector: LiveSector, index: SectorIndex, plan: ShadowPlan) -> b
     of = sector.sampled_of
     if of is None or sun_or_box_moved(of, plan.to_sun, plan.boxes):
         return True
-    return covers_whole(plan, index) and not covers_whole(of, index)
-
-
-def covers_whole(plan: ShadowPlan, index: SectorIndex) -> bool:
-    """Whether a sector's own ground lies in a map as far as its level extent goes."""
-    away = np.abs((index.origin + SECTOR_SIZE_M / 2 - plan.middle)[[0, 2]]).max()
-    return bool(away + SECTOR_SIZE_M / 2 <= MAP_TEXELS / TEXELS_PER_METRE / 2)
+    return plan.covers_whole(index) and not of.covers_whole(index)
 
 
 def covered(plan: ShadowPlan | None, sectors: Collection[SectorIndex]) -> tuple[SectorIndex, ...]:

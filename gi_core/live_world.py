@@ -149,9 +149,10 @@ class LiveWorld:
         self._relight(tick, light, report)
         lap("relight")
         if self._shadows is not None:
-            sampled = self._shadows.step(players.positions, light.given, light.sun_is_up, boxes, self.streamer.residents)
+            sampled = self._shadows.step(players.positions, light, boxes, self.streamer.residents)
             for index in sampled:
-                self._needs.disturb(self._row[index], BURST_CHANGE)
+                other = index in self.streamer.residents and self.streamer.residents[index].has_other_source
+                self._needs.disturb(self._row[index], WHOLLY if other else BURST_CHANGE)
         lap("shadow_map")
         report.missing = self.volumes.missing
         lit = set(report.relit) | set(report.settled)

@@ -73,6 +73,11 @@ class ShadowPlan:
         record["origin"] = origin - self.middle
         return record
 
+    def covers_whole(self, index: SectorIndex) -> bool:
+        """Whether a sector's own ground lies in the map as far as its level extent goes."""
+        away = np.abs((index.origin + SECTOR_SIZE_M / 2 - self.middle)[[0, 2]]).max()
+        return bool(away + SECTOR_SIZE_M / 2 <= MAP_TEXELS / TEXELS_PER_METRE / 2)
+
 
 def plan_map(
     position: Float64, to_sun: Float64, sectors: Collection[SectorIndex], low_m: float, top_m: float, boxes: Float64 = NO_BOXES
@@ -126,16 +131,21 @@ def _sectors_towards_sun(
 def sun_or_box_moved(last: ShadowPlan, to_sun: Float64, boxes: Float64) -> bool:
     """Whether the sun, or a corner of a box (b, 8, 3) [m], has moved enough since a map was planned for another to be drawn. The map's
     place is not asked for."""
-    if float(last.to_sun @ to_sun) < math.cos(math.radians(SUN_MOVED_DEGREES)) or len(boxes) != len(last.boxes):
+    if not is_near(last.to_sun, to_sun, SUN_MOVED_DEGREES) or len(boxes) != len(last.boxes):
         return True
     return bool((np.linalg.norm(boxes - last.boxes, axis=2) > BOX_MOVED_M).any())
 
 
+def is_near(a: Float64, b: Float64, degrees: float = FRESH_DEGREES) -> bool:
+    """Whether two suns, directions (3,), unit, stand within so many degrees of each other: by default, whether samples of a map that was
+    drawn for the one are fresh under the other."""
+    return float(a @ b) >= math.cos(math.radians(degrees))
+
+
 def oldest_fresh(drawn_for: Sequence[Float64], to_sun: Float64) -> int:
     """Index of the first of a run of maps, oldest first, from which on each was drawn for a sun within FRESH_DEGREES of ``to_sun``."""
-    limit = math.cos(math.radians(FRESH_DEGREES))
     first = len(drawn_for)
-    while first > 0 and float(drawn_for[first - 1] @ to_sun) >= limit:
+    while first > 0 and is_near(drawn_for[first - 1], to_sun):
         first -= 1
     return first
 

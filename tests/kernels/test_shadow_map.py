@@ -10,7 +10,7 @@ from gi_core.device import Device, available_devices, describe, shared_device
 from gi_core.grid import SectorIndex
 from gi_core.layout import NO_SAMPLE, WHOLE_SAMPLE
 from gi_core.resident_sector import ResidentSector
-from gi_core.shadow_map import ShadowMap, SunSamples
+from gi_core.shadow_map import LAST_NUMBER, ShadowMap, SunSamples
 from gi_core.shadow_plan import (
     MAP_TEXELS,
     NO_BOXES,
@@ -157,6 +157,39 @@ def test_each_surfel_knows_its_source(device, make_sector):
     shadow_map.sample(samples)
     gone, _ = samples.read()
     assert (gone[facing] == NO_SAMPLE).all()
+
+
+def test_samples_grow_old_between_looks(device, make_sector):
+    shadow_map = drawn(device, random_city(3), towards(50.0))
+    samples = samples_of(device, make_sector, 5)
+    assert not samples.forget_old(towards(50.0))  # there are none
+    shadow_map.sample(samples)
+    # The next map covers none of the surfels: most samples are of the first look, the second's are of surfels that face away.
+    shadow_map.begin(plan_map(MIDDLE + np.array([2000.0, 0, 0]), towards(50.8), {ZERO}, 0.0, TOP))
+    shadow_map.draw(1)
+    shadow_map.sample(samples)
+    before, number = samples.read()
+    assert {1, 2} <= set(number[before != NO_SAMPLE].tolist())
+    assert not samples.forget_old(towards(50.9))
+    assert samples.forget_old(towards(51.2))
+    after, _ = samples.read()
+    assert (after[number < 2] == NO_SAMPLE).all()
+    np.testing.assert_array_equal(after[number == 2], before[number == 2])
+    assert samples.are_there
+    assert samples.forget_old(towards(30.0))
+    assert not samples.are_there
+    assert (samples.read()[0] == NO_SAMPLE).all()
+
+
+def test_samples_start_anew_when_looks_run_out_of_numbers(device, make_sector):
+    shadow_map = drawn(device, random_city(3), towards(50.0))
+    samples, other = samples_of(device, make_sector, 5), samples_of(device, make_sector, 5)
+    samples.number = LAST_NUMBER - 1
+    for number in (LAST_NUMBER, 1):
+        shadow_map.sample(samples)
+        assert samples.number == number
+    shadow_map.sample(other)
+    np.testing.assert_array_equal(samples.read(), other.read())
 
 
 def test_a_ray_that_leaves_what_was_drawn_below_the_roofs_is_not_valid(device, make_sector):
