@@ -95,7 +95,7 @@ class SunSources:
         self.sample_seconds += self._timed(lambda: self._map.sample(samples))
         samples.resident.set_sun_sample(None)
         share, number = samples.read()
-        return share / WHOLE_SAMPLE, (number == self._map.number) & (share != NO_SAMPLE)
+        return share / WHOLE_SAMPLE, (number == samples.number) & (share != NO_SAMPLE)
 
     def _timed(self, run: Callable[[], None]) -> list[float]:
         taken = []

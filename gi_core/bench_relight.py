@@ -36,7 +36,7 @@ from gi_core.relight_input import RelightInput
 from gi_core.resident_sector import ResidentSector
 from gi_core.sector import Sector
 from gi_core.shadow_map import ShadowMap, SunSamples
-from gi_core.shadow_plan import MovingBox, box_corners, caster_records, plan_map
+from gi_core.shadow_plan import MovingBox, box_corners, box_triangles, caster_records, plan_map
 from gi_core.world import Lamp
 
 # Ticks rotate over this many sectors, so that no tick finds the last one's data in the nearest cache.
@@ -51,7 +51,7 @@ CITY_TOP_M = 40.0
 def made_up_city() -> Geometry:
     """Sixteen boxes on one sector: something for shadow rays to meet."""
     boxes = [MovingBox((x, y, z), (4.0, y, 4.0), x) for x in (8, 24, 40, 56) for z, y in ((8, 5), (24, 10), (40, 15), (56, 20))]
-    corners = np.concatenate([box_corners(box) for box in boxes])
+    corners = box_triangles(box_corners(boxes))
     triangles = np.arange(3 * len(corners), dtype=np.int32).reshape(-1, 3)
     colours = np.zeros((len(corners), 3), np.float32)
     return Geometry(corners.reshape(-1, 3), triangles, colours, colours)

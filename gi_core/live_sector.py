@@ -21,7 +21,7 @@ from gi_core.resident_sector import ResidentSector
 from gi_core.sector import Sector
 from gi_core.settings import Settings
 from gi_core.shadow_map import ShadowMap, SunSamples
-from gi_core.shadow_plan import ShadowPlan
+from gi_core.shadow_plan import FRESH_DEGREES, ShadowPlan, is_near
 from gi_core.sky_patches import face_exitance
 from gi_core.world import Lamp
 
@@ -30,8 +30,11 @@ BURST_CHANGE = 0.05
 BURST_PASSES = 3
 # Before a sector is shown for the first time: what later bounces add is then a twentieth, which comes while it fades in.
 FIRST_PASSES = 4
-# From loaded to fully shown: half a second at 30 Hz, so that nothing pops when a sector arrives late.
-FADE_TICKS = 15
+# A second at 30 Hz, so that nothing pops when a sector arrives late, or when its sun's visibility has another source: in half of that, a
+# voxel that ends ten times as bright moves by a third in its first ticks.
+FADE_TICKS = 30
+# A sun this far from where it stood has jumped, and all light with it: what follows it follows at once.
+SUN_JUMPED_DEGREES = 2 * FRESH_DEGREES
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +61,11 @@ class LiveLight:
         return bool((self.lighting.sun.irradiance > 0).any())
 
     @cached_property
+    def to_sun(self) -> Float64:
+        """(3,) float64, unit: towards the first of the lights."""
+        return np.asarray(self.given.lights["direction"][0, :3], np.float64)
+
+    @cached_property
     def distant(self) -> Float32:
         """(6, 3) float32 [lx]: what a distant probe's sky factors multiply."""
         return face_exitance(self.lighting)
@@ -75,6 +83,8 @@ class LiveSector:
         self.samples: SunSamples | None = None
         self.sampled_of: ShadowPlan | None = None
         """The plan of the shadow map that its samples are from; None before any."""
+        self.has_other_source = False
+        """Whether the next relight finds the sun's visibility from another source than the last did."""
         self.is_lit = False
         """Whether it was ever relit; before, it must not be shown."""
         self.shown_at = -1
@@ -83,6 +93,8 @@ class LiveSector:
         self._tracing = tracing
         self._low, self._high = _bounds(sector)
         self._faded = 0
+        self._blended_faded = 0
+        """``_faded`` when what is shown was last blended."""
         self._cubes: Float32 = np.zeros((sector.probe_count, sector.basis_size, 3), np.float32)
         self.host_nbytes = self.resident.host_nbytes + self._cubes.nbytes
         """Bytes in the host's memory."""
@@ -113,7 +125,7 @@ class LiveSector:
 
     @property
     def is_fading(self) -> bool:
-        """Whether it is still blended with what stood in for it."""
+        """Whether it is still blended with what was shown before."""
         return self._faded < FADE_TICKS
 
     def make_room_for_samples(self) -> None:
@@ -125,11 +137,14 @@ class LiveSector:
         """Take samples of a shadow map that was just drawn; they light the sector at its next relight."""
         self.make_room_for_samples()
         assert self.samples is not None
+        before, now = self.sampled_of, shadow_map.plan
+        assert now is not None
         shadow_map.sample(self.samples)
-        self.sampled_of = shadow_map.plan
+        self.sampled_of = now
+        self.has_other_source |= before is None or not self._is_whole_in(before) or not self._is_whole_in(now)
 
     def drop_sun_samples(self) -> None:
-        """Back to the bake's visibility: the sun has set, or there is no map any more."""
+        """Back to the bake's visibility, with no room for samples: the sun has set."""
         if self.samples is not None:
             self.samples = self.sampled_of = None
             self.resident.set_sun_sample(None)
@@ -159,6 +174,7 @@ class LiveSector:
     def light(self, light: LiveLight) -> None:
         """Have the relight that follows read the lamps of this light, if they can be had at once. ``measure`` must follow it."""
         self._lamps_late = not self.set_lamps(light, wait=False)
+        self._take_samples(light)
 
     def measure(self) -> float:
         """Read what a relight gave: how far it moved the probes' light, as a share of the brightest."""
@@ -177,57 +193,104 @@ class LiveSector:
         """
         if not self.set_lamps(light, wait=False):
             return False
+        self._take_samples(light)
         self._cubes = relighter.converge(self.resident, light.given).cubes
         self.is_lit = True
         return True
 
     def advance(self, tick: int, changed: bool, is_read: bool) -> None:
-        """Say whether what is shown changes at a tick: by a relight or other gains (``changed``), or because it fades in.
+        """Say whether what is shown changes at a tick: by a relight or other gains (``changed``), or because it fades.
 
-        A sector fades in where something stood for it: while no published volume reads it (``is_read``), it arrives unseen.
+        A sector fades where something else was shown before: while no published volume reads it (``is_read``), it changes unseen.
         """
-        if self.is_lit and self._faded < FADE_TICKS:
-            self._faded = self._faded + 1 if is_read else FADE_TICKS
+        if self.is_lit and self.is_fading:
+            if is_read:
+                self._faded += 1
+            else:
+                self._faded, self._shown = FADE_TICKS, None
             changed = True
         if changed:
             self.shown_at = tick
 
     def shown(self, settings: Settings, placeholder: Callable[[], Float32], basis: str) -> cl.Buffer:
-        """The light to show, on the device, in a basis: the sector's own, or a blend with ``placeholder`` (6, 3) [lx], a cube, while it
-        fades in, under the artists' gains."""
+        """The light to show, on the device, in a basis: the sector's own under the artists' gains, or while it fades a blend with what
+        was shown before: ``placeholder`` (6, 3) [lx], a cube, where that was not of the sector."""
         return self.resident.converted(basis, self._own_shown(settings, placeholder))
 
     def _own_shown(self, settings: Settings, placeholder: Callable[[], Float32]) -> cl.Buffer:
         if not self.is_fading and settings.bounce_factor == 1.0 and not settings.has_ambient:
             self._shown = self._first = self._room = None
             return self.resident.cubes
-        if self._shown is None or self._blended_at != self.shown_at:
-            self._blend(settings, placeholder())
-            self._blended_at = self.shown_at
-        assert self._shown is not None
+        if self._shown is None:
+            self._shown = self._device.allocate(self.resident.cubes.size)
+            self._blended_at = -1
+            if self.is_fading:
+                self._blended_faded = 0
+                self._write_shown(placeholder())
+        if self._blended_at != self.shown_at:
+            self._blend(self._shown, settings)
+            self._blended_at, self._blended_faded = self.shown_at, self._faded
         return self._shown
 
-    def _blend(self, settings: Settings, placeholder: Float32) -> None:
+    def _blend(self, shown: cl.Buffer, settings: Settings) -> None:
         device, resident = self._device, self.resident
         sector = resident.sector
         rows = sector.probe_count * sector.basis_size
-        if self._shown is None:
-            self._shown = device.allocate(16 * rows)
-            self._room = device.upload(sector.probe_room)
+        self._room = self._room or device.upload(sector.probe_room)
         gains = settings.bounce_factor != 1.0
         ambient = np.zeros((2, sector.basis_size, 4), np.float32)
         basis = basis_of_size(sector.basis_size)
         ambient[:, :, :3] = settings.ambient(basis)
-        standing_in = np.pad(from_axes(basis) @ placeholder.astype(np.float32), ((0, 0), (0, 1)))
+        share = (self._faded - self._blended_faded) / (FADE_TICKS - self._blended_faded) if self.is_fading else 1.0
         arguments: list[object] = [np.uint32(rows), resident.cubes]
         if gains:
             self._first = self._first or device.allocate(16 * rows)
             resident.enqueue_first_bounce(self._first)
             arguments += [self._first, np.float32(settings.bounce_factor)]
         kernel = device.shared_kernel("show_probes", CUBE_ROWS=sector.basis_size, HAS_BOUNCE_FACTOR=int(gains))
-        uploads = device.upload(ambient), device.upload(standing_in)
         if rows:
-            kernel.launch_1d(rows, *arguments, self._room, *uploads, np.float32(self._faded / FADE_TICKS), self._shown)
+            kernel.launch_1d(rows, *arguments, self._room, device.upload(ambient), np.float32(share), shown)
+
+    def _write_shown(self, placeholder: Float32) -> None:
+        """Show a cube (6, 3) [lx] at every probe."""
+        sector = self.resident.sector
+        row = np.pad(from_axes(basis_of_size(sector.basis_size)) @ placeholder.astype(np.float32), ((0, 0), (0, 1)))
+        if sector.probe_count:
+            cl.enqueue_copy(self._device.queue, self._shown, np.tile(row.astype(np.float32), (sector.probe_count, 1)))
+
+    def _take_samples(self, light: LiveLight) -> None:
+        """Before a relight: forget samples that are too old for it, and where the sun's visibility has another source than it had, have
+        what is shown go over from what it was."""
+        self._expire_samples(light)
+        if not self.has_other_source:
+            return
+        self.has_other_source = False
+        if self._shown is None and self.is_fading:
+            return  # nothing of it was shown
+        if self._shown is None:
+            self._shown = self._device.allocate(self.resident.cubes.size)
+            cl.enqueue_copy(self._device.queue, self._shown, self.resident.cubes)
+        self._faded = self._blended_faded = 0
+
+    def _expire_samples(self, light: LiveLight) -> None:
+        """Forget samples of maps for a sun too far from where it stands; back to the bake's visibility when none is left."""
+        samples, of = self.samples, self.sampled_of
+        if samples is None or of is None:
+            return
+        if not light.sun_is_up:  # the first of the lights is the moon, which samples know nothing of
+            self.drop_sun_samples()
+        elif samples.forget_old(light.to_sun):
+            if samples.are_there:
+                self.resident.set_sun_sample(samples.sun_sample)
+                self.has_other_source |= not self._is_whole_in(of)
+            else:
+                self.sampled_of = None
+                self.resident.set_sun_sample(None)
+                self.has_other_source = is_near(of.to_sun, light.to_sun, SUN_JUMPED_DEGREES)
+
+    def _is_whole_in(self, plan: ShadowPlan) -> bool:
+        """Whether at most far surfels, which stand on others' ground, lack samples of a map: what they change is not seen."""
+        return plan.covers_whole(self.resident.sector.index)
 
 
 def _bounds(sector: Sector) -> tuple[Float64, Float64]:

@@ -15,10 +15,20 @@ from gi_core.device import Device
 from gi_core.errors import SectorlightError
 from gi_core.grid import SectorIndex, volume_first_voxel
 from gi_core.layout import SHADOW_TRIANGLE
-from gi_core.live_sector import LiveSector
-from gi_core.relight_input import RelightInput
+from gi_core.live_sector import LiveLight, LiveSector
 from gi_core.shadow_map import ShadowMap
-from gi_core.shadow_plan import MAP_TEXELS, TEXELS_PER_METRE, MovingBox, ShadowPlan, caster_records, plan_map, sun_or_box_moved
+from gi_core.shadow_plan import (
+    MAP_TEXELS,
+    NO_BOXES,
+    TEXELS_PER_METRE,
+    MovingBox,
+    ShadowPlan,
+    box_corners,
+    caster_records,
+    is_near,
+    plan_map,
+    sun_or_box_moved,
+)
 from gi_core.volume import plan_boxes
 
 log = logging.getLogger("sectorlight.shadows")
@@ -55,6 +65,8 @@ class LiveShadows:
         self._turn = 0
         self._to_sample: list[SectorIndex] = []
         self._dark = True
+        self._boxes: tuple[Sequence[MovingBox], Float64] = (), NO_BOXES
+        """The boxes of the last tick, and their corners."""
 
     @property
     def nbytes(self) -> int:
@@ -64,13 +76,12 @@ class LiveShadows:
     def step(
         self,
         positions: Float64,
-        given: RelightInput,
-        sun_is_up: bool,
+        light: LiveLight,
         boxes: Sequence[MovingBox],
         residents: Mapping[SectorIndex, LiveSector],
     ) -> tuple[SectorIndex, ...]:
         """One tick's share of planning, drawing and sampling, for players at positions (p, 3) [m]; sectors whose sun that changes."""
-        if not sun_is_up:
+        if not light.sun_is_up:
             if self._dark:
                 return ()
             self._planning, self._to_sample, self._dark = None, [], True
@@ -79,27 +90,32 @@ class LiveShadows:
             return tuple(residents)
         self._dark = False
         plan = self._map.plan
-        if self._to_sample and plan is not None:
+        if self._to_sample and plan is not None and is_near(plan.to_sun, light.to_sun):
             some = self._to_sample[:SECTORS_SAMPLED_PER_TICK]
             del self._to_sample[:SECTORS_SAMPLED_PER_TICK]
             chosen = tuple(index for index in some if index in residents and wants_samples(residents[index], index, plan))
             for index in chosen:
                 residents[index].sample_sun(self._map)
             return chosen
-        if self._map.is_drawing:
+        # A map for a sun that has moved away, as it does when the clock jumps, is given up for another.
+        drawing = self._map.drawing
+        if drawing is not None and is_near(drawing.to_sun, light.to_sun):
             if self._map.draw(TRIANGLES_PER_TICK):
                 self._to_sample = list(covered(self._map.plan, residents))
         elif self._planning is not None:
             if self._planning.done():
-                plan, self._to_draw = self._planning.result()
+                plan, casters = self._planning.result()
                 self._planning = None
-                if plan is not None:
+                if plan is not None and is_near(plan.to_sun, light.to_sun):
+                    self._to_draw = casters
                     self._map.begin(plan)
         elif len(positions):
-            self._plan(positions, np.asarray(given.lights["direction"][0, :3], np.float64), boxes, residents)
+            if boxes is not self._boxes[0]:
+                self._boxes = boxes, box_corners(boxes)
+            self._plan(positions, light.to_sun, self._boxes[1], residents)
         return ()
 
-    def _plan(self, positions: Float64, to_sun: Float64, boxes: Sequence[MovingBox], residents: Mapping[SectorIndex, LiveSector]) -> None:
+    def _plan(self, positions: Float64, to_sun: Float64, boxes: Float64, residents: Mapping[SectorIndex, LiveSector]) -> None:
         """Plan a map for the next player, in turn, whose volume reads a sector that lacks samples."""
         count = len(positions)
         for offset in range(min(count, PLAYERS_LOOKED_AT_PER_TICK)):
@@ -108,7 +124,7 @@ class LiveShadows:
             here = [index for index in touched if index in residents]
             if any(lacks_samples(residents[index], to_sun, boxes) for index in here):
                 self._turn = player + 1
-                self._planning = self._planner.submit(self._prepare, positions[player].copy(), to_sun, tuple(boxes))
+                self._planning = self._planner.submit(self._prepare, positions[player].copy(), to_sun, boxes)
                 return
         self._turn += PLAYERS_LOOKED_AT_PER_TICK
 
@@ -126,7 +142,7 @@ class LiveShadows:
         """Stop planning."""
         self._planner.shutdown(cancel_futures=True)
 
-    def _prepare(self, position: Float64, to_sun: Float64, boxes: tuple[MovingBox, ...]) -> tuple[ShadowPlan | None, Casters]:
+    def _prepare(self, position: Float64, to_sun: Float64, boxes: Float64) -> tuple[ShadowPlan | None, Casters]:
         """In the planner's thread: a map, and the triangles that it draws."""
         plan = plan_map(position, to_sun, self._known, *self._heights, boxes)
         if plan is None:
@@ -150,7 +166,7 @@ class LiveShadows:
         return self._to_draw[index]
 
 
-def lacks_samples(sector: LiveSector, to_sun: Float64, boxes: Sequence[MovingBox]) -> bool:
+def lacks_samples(sector: LiveSector, to_sun: Float64, boxes: Float64) -> bool:
     """Whether a sector that a volume reads has no samples, or old ones: the sun or a box has moved since."""
     of = sector.sampled_of
     return of is None or sun_or_box_moved(of, to_sun, boxes)
@@ -161,13 +177,7 @@ def wants_samples(sector: LiveSector, index: SectorIndex, plan: ShadowPlan) -> b
     of = sector.sampled_of
     if of is None or sun_or_box_moved(of, plan.to_sun, plan.boxes):
         return True
-    return covers_whole(plan, index) and not covers_whole(of, index)
-
-
-def covers_whole(plan: ShadowPlan, index: SectorIndex) -> bool:
-    """Whether a sector's own ground lies in a map as far as its level extent goes."""
-    away = np.abs((index.origin + SECTOR_SIZE_M / 2 - plan.middle)[[0, 2]]).max()
-    return bool(away + SECTOR_SIZE_M / 2 <= MAP_TEXELS / TEXELS_PER_METRE / 2)
+    return plan.covers_whole(index) and not of.covers_whole(index)
 
 
 def covered(plan: ShadowPlan | None, sectors: Collection[SectorIndex]) -> tuple[SectorIndex, ...]:

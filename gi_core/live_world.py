@@ -151,9 +151,10 @@ class LiveWorld:
         self._relight(tick, light, report)
         lap("relight")
         if self._shadows is not None:
-            sampled = self._shadows.step(players.positions, light.given, light.sun_is_up, boxes, self.streamer.residents)
+            sampled = self._shadows.step(players.positions, light, boxes, self.streamer.residents)
             for index in sampled:
-                self._needs.disturb(self._row[index], BURST_CHANGE)
+                other = index in self.streamer.residents and self.streamer.residents[index].has_other_source
+                self._needs.disturb(self._row[index], WHOLLY if other else BURST_CHANGE)
         lap("shadow_map")
         report.missing = self.volumes.missing
         lit = set(report.relit) | set(report.settled)
@@ -186,7 +187,8 @@ class LiveWorld:
             given = RelightInput(np.ones((world.sky_patches, 3), np.float32), dark, snow, world.sky)
             self._relighter.relight([sector.resident], given)
         for settings in (NEUTRAL, Settings(bounce_factor=2.0)):
-            box = plan_boxes(volume_first_voxel(index.origin + 32.0))[0]
+            # The sector's own part of a volume around its middle: what lies beyond its voxels must not be read.
+            box = next(box for box in plan_boxes(volume_first_voxel(index.origin + 32.0)) if box.index == index)
             target = self._device.allocate(4 * 3 * BASIS_SIZES[self.basis] * int(np.prod(VOLUME_SHAPE)))
             cubes = sector.shown(settings, lambda: np.zeros((6, 3), np.float32), self.basis)
             sector.resident.fill_volume(box_record(box, sector.resident.sector), (1, 1, 1), target, cubes, self.basis)

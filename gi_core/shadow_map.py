@@ -18,22 +18,23 @@ from gi_core.layout import NO_SAMPLE, SHADOW_ROW_TEXELS
 from gi_core.relight_launch import SURFELS_PER_GROUP
 from gi_core.resident_sector import ResidentSector
 from gi_core.sector import counts
-from gi_core.shadow_plan import MAP_TEXELS, ShadowPlan, box_corners, oldest_fresh, triangle_records
+from gi_core.shadow_plan import MAP_TEXELS, ShadowPlan, box_triangles, oldest_fresh, triangle_records
 
 NOTHING_DRAWN = np.float32(-1e30)  # as in shadow_map.h
 # Each work-item looks at every triangle. A CPU wants few of them, though more than cores; a GPU wants many.
 CPU_ITEMS_PER_CORE, GPU_ITEMS = 2, 256
 # Triangles of sectors that stay on the device for the next map, 48 bytes each.
 KEPT_BYTES = 1 << 25
-# Maps are numbered with 16 bits; samples start anew when they run out.
+# A sector's looks at maps are numbered with 16 bits; its samples start anew when they run out.
 LAST_NUMBER = 0xFFFF
 
 
 class SunSamples:
-    """One resident sector's samples: share of the sun, and which map said so. 19 bytes a surfel; none before the first map.
+    """One resident sector's samples: share of the sun, and at which of its looks at a map each was taken. 19 bytes a surfel.
 
     sun_sample : (S padded to whole groups of eight,) uint8 on the device: share of layout.WHOLE_SAMPLE, or NO_SAMPLE
-    sampled_in : (S padded,) uint16 on the device: the number of the map that a sample is from, 0 before any
+    sampled_in : (S padded,) uint16 on the device: the number of the look that a sample is from, 0 before any
+    number : of the last look, 0 before any
     """
 
     def __init__(self, device: Device, resident: ResidentSector) -> None:
@@ -48,6 +49,10 @@ class SunSamples:
         self.place = device.upload(place)
         self.sun_sample = device.upload(np.full(padded, NO_SAMPLE, np.uint8))
         self.sampled_in = device.allocate(2 * padded)
+        self.number = 0
+        self._forget = device.shared_kernel("forget_sun_samples")
+        self._looks: list[tuple[int, Float64]] = []
+        """Numbers and suns of the looks that samples may be from, oldest first."""
         self._framed: ShadowPlan | None = None
         self._frame: AnyArray
 
@@ -67,14 +72,44 @@ class SunSamples:
             self._framed, self._frame = plan, plan.frame(self.resident.sector.index.origin)
         return self._frame
 
+    @property
+    def are_there(self) -> bool:
+        """Whether any surfel may have a sample."""
+        return bool(self._looks)
+
+    def look(self, to_sun: Float64) -> int:
+        """Count another look, at a map for a sun towards (3,), unit: the number of the oldest look whose samples are fresh under it."""
+        if self.number == LAST_NUMBER:
+            device = self.resident.device
+            cl.enqueue_fill_buffer(device.queue, self.sampled_in, np.uint16(0), 0, self.sampled_in.size)
+            self.number, self._looks = 0, []
+        self.number += 1
+        self._looks.append((self.number, to_sun))
+        return self._oldest_kept(to_sun)
+
+    def forget_old(self, to_sun: Float64) -> bool:
+        """Enqueue the forgetting of samples that are not fresh under a sun towards (3,), unit; whether there may be such."""
+        looks = len(self._looks)
+        kept = self._oldest_kept(to_sun)
+        if len(self._looks) == looks:
+            return False
+        if self.groups:
+            self._forget.launch_1d(self.groups, np.uint32(self.groups), np.uint32(kept), self.sampled_in, self.sun_sample)
+        return True
+
     def read(self) -> tuple[UInt8, UInt16]:
-        """(S,) uint8 samples and (S,) uint16 map numbers: a surfel's source is the map when its number is the map's, its last sample
-        when it is an older one, and the bake where the sample is NO_SAMPLE."""
+        """(S,) uint8 samples and (S,) uint16 numbers of looks: a surfel's source is the map when its number is the last look's, its last
+        sample when it is an older one, and the bake where the sample is NO_SAMPLE."""
         count = self.resident.sector.surfel_count
         sample, sampled_in = np.zeros(count, np.uint8), np.zeros(count, np.uint16)
         self.resident.device.read(self.sun_sample, sample)
         self.resident.device.read(self.sampled_in, sampled_in)
         return sample, sampled_in
+
+    def _oldest_kept(self, to_sun: Float64) -> int:
+        """Leave looks out that are not fresh under a sun; the number of the oldest that is left, or of the next when none is."""
+        del self._looks[: oldest_fresh([drawn_for for _, drawn_for in self._looks], to_sun)]
+        return self._looks[0][0] if self._looks else self.number + 1
 
 
 class ShadowMap:
@@ -85,11 +120,11 @@ class ShadowMap:
         point, world frame."""
         self.plan: ShadowPlan | None = None
         """Of the map that surfels look at."""
-        self.number = 0
+        self.drawing: ShadowPlan | None = None
+        """Of the map that has been begun and is not finished."""
         self._device = device
         self._casters = casters
         self._top_m = top_m
-        self._drawing: ShadowPlan | None = None
         self._left: list[SectorIndex] = []
         self._front, self._back = (cl.Buffer(device.context, cl.mem_flags.READ_WRITE, 4 * MAP_TEXELS * SHADOW_ROW_TEXELS) for _ in range(2))
         self._draw = device.shared_kernel("draw_shadow_map")
@@ -98,21 +133,15 @@ class ShadowMap:
         self._rows_apart = CPU_ITEMS_PER_CORE * device.device.max_compute_units if is_cpu else GPU_ITEMS
         self._triangles: OrderedDict[SectorIndex, tuple[cl.Buffer, int]] = OrderedDict()
         self._kept_bytes = 0
-        self._drawn_for: list[tuple[int, Float64]] = []
 
     @property
     def nbytes(self) -> int:
         """Bytes on the device."""
         return int(self._front.size + self._back.size + self._kept_bytes)
 
-    @property
-    def is_drawing(self) -> bool:
-        """Whether a map has been begun and not finished."""
-        return self._drawing is not None
-
     def begin(self, plan: ShadowPlan) -> None:
         """Start to draw another map; what was begun before is given up."""
-        self._drawing, self._left = plan, list(plan.sectors)
+        self.drawing, self._left = plan, list(plan.sectors)
         cl.enqueue_fill_buffer(self._device.queue, self._back, NOTHING_DRAWN, 0, self._back.size)
 
     def draw(self, most_triangles: int) -> bool:
@@ -120,7 +149,7 @@ class ShadowMap:
 
         Raises what ``casters`` raises; the sector is then left out of this map.
         """
-        plan = self._drawing
+        plan = self.drawing
         if plan is None:
             return False
         drawn = 0
@@ -131,17 +160,11 @@ class ShadowMap:
             drawn += count
         if self._left:
             return False
-        if plan.boxes:
-            corners = np.concatenate([box_corners(box) for box in plan.boxes]) - plan.middle
-            self._enqueue(plan, plan.middle, self._device.upload(triangle_records(corners)), len(corners))
+        if len(plan.boxes):
+            triangles = box_triangles(plan.boxes - plan.middle)
+            self._enqueue(plan, plan.middle, self._device.upload(triangle_records(triangles)), len(triangles))
         self._front, self._back = self._back, self._front
-        self.plan, self._drawing = plan, None
-        if self.number == LAST_NUMBER:
-            self.number, self._drawn_for = 0, []
-        self.number += 1
-        self._drawn_for.append((self.number, plan.to_sun))
-        first = oldest_fresh([to_sun for _, to_sun in self._drawn_for], plan.to_sun)
-        del self._drawn_for[:first]
+        self.plan, self.drawing = plan, None
         return True
 
     def sample(self, samples: SunSamples) -> None:
@@ -149,8 +172,7 @@ class ShadowMap:
         plan, resident = self.plan, samples.resident
         if plan is None or resident.sector.surfel_count == 0:
             return
-        if self.number == 1:  # the first map, or the first after numbers ran out: older samples say nothing
-            cl.enqueue_fill_buffer(self._device.queue, samples.sampled_in, np.uint16(0), 0, samples.sampled_in.size)
+        oldest = samples.look(plan.to_sun)
         self._sample.launch_1d(
             samples.groups,
             np.uint32(samples.groups),
@@ -160,8 +182,8 @@ class ShadowMap:
             self._front,
             np.float32(self._top_m),
             np.float32(min(plan.reach_height_m, 1e9)),
-            np.uint16(self.number),
-            np.uint16(self._drawn_for[0][0]),
+            np.uint16(samples.number),
+            np.uint16(oldest),
             samples.sun_sample,
             samples.sampled_in,
         )

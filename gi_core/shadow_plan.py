@@ -26,6 +26,12 @@ FRESH_DEGREES = 1.0
 # Below this the map's prism is longer than the reach for anything taller than a storey.
 LOWEST_SUN_DEGREES = 1.0
 
+NO_BOXES: Float64 = np.zeros((0, 8, 3))
+# Sides of its middle that a box's corners lie on, along its own x, y and z; and the two triangles of each face.
+_CORNER_SIDES = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+_FACES = ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5))
+_FACE_TRIANGLES = np.array([corner for a, b, c, d in _FACES for corner in ((a, b, c), (a, c, d))])
+
 
 @dataclass(frozen=True)
 class MovingBox:
@@ -45,7 +51,7 @@ class ShadowPlan:
     """One drawing of the map.
 
     middle : (3,) float64 [m], world frame; to_sun, across, down : (3,) float64, unit, at right angles
-    sectors : those whose geometry is drawn; boxes : moving ones, drawn last
+    sectors : those whose geometry is drawn; boxes : (b, 8, 3) float64 [m], world frame, corners of moving ones, drawn last
     reach_m : level distance towards the sun from any point of the map up to which all geometry is drawn
     reach_height_m : how much higher a ray to the sun is by then; inf where it is above the whole city
     """
@@ -55,7 +61,7 @@ class ShadowPlan:
     across: Float64
     down: Float64
     sectors: tuple[SectorIndex, ...]
-    boxes: tuple[MovingBox, ...]
+    boxes: Float64
     reach_m: float
     reach_height_m: float
 
@@ -67,13 +73,18 @@ class ShadowPlan:
         record["origin"] = origin - self.middle
         return record
 
+    def covers_whole(self, index: SectorIndex) -> bool:
+        """Whether a sector's own ground lies in the map as far as its level extent goes."""
+        away = np.abs((index.origin + SECTOR_SIZE_M / 2 - self.middle)[[0, 2]]).max()
+        return bool(away + SECTOR_SIZE_M / 2 <= MAP_TEXELS / TEXELS_PER_METRE / 2)
+
 
 def plan_map(
-    position: Float64, to_sun: Float64, sectors: Collection[SectorIndex], low_m: float, top_m: float, boxes: Sequence[MovingBox] = ()
+    position: Float64, to_sun: Float64, sectors: Collection[SectorIndex], low_m: float, top_m: float, boxes: Float64 = NO_BOXES
 ) -> ShadowPlan | None:
     """The map around a player at ``position`` (3,) [m] for a sun towards ``to_sun`` (3,), unit; None when the sun is too low for one.
 
-    sectors : all that have geometry; low_m, top_m : the city's lowest and highest point
+    sectors : all that have geometry; low_m, top_m : the city's lowest and highest point; boxes : ``box_corners`` of moving ones
     """
     if to_sun[1] < math.sin(math.radians(LOWEST_SUN_DEGREES)):
         return None
@@ -89,7 +100,7 @@ def plan_map(
     reach = min(MAX_REACH_M, above_all)
     height = math.inf if above_all <= MAX_REACH_M else MAX_REACH_M * float(to_sun[1]) / horizontal
     drawn = _sectors_towards_sun(middle, to_sun, np.stack([across, down]), sectors, (low_m, top_m), reach)
-    return ShadowPlan(middle, to_sun, across, down, drawn, tuple(boxes), reach, height)
+    return ShadowPlan(middle, to_sun, across, down, drawn, boxes, reach, height)
 
 
 def _sectors_towards_sun(
@@ -117,34 +128,43 @@ def _sectors_towards_sun(
     return tuple(index for index, ok in zip(near, meets.tolist(), strict=True) if ok)
 
 
-def sun_or_box_moved(last: ShadowPlan, to_sun: Float64, boxes: Sequence[MovingBox]) -> bool:
-    """Whether the sun or a box has moved enough since a map was planned for another to be drawn. The map's place is not asked for."""
-    if float(last.to_sun @ to_sun) < math.cos(math.radians(SUN_MOVED_DEGREES)) or len(boxes) != len(last.boxes):
+def sun_or_box_moved(last: ShadowPlan, to_sun: Float64, boxes: Float64) -> bool:
+    """Whether the sun, or a corner of a box (b, 8, 3) [m], has moved enough since a map was planned for another to be drawn. The map's
+    place is not asked for."""
+    if not is_near(last.to_sun, to_sun, SUN_MOVED_DEGREES) or len(boxes) != len(last.boxes):
         return True
-    return any(math.dist(a.position, b.position) > BOX_MOVED_M for a, b in zip(boxes, last.boxes, strict=True))
+    return bool((np.linalg.norm(boxes - last.boxes, axis=2) > BOX_MOVED_M).any())
+
+
+def is_near(a: Float64, b: Float64, degrees: float = FRESH_DEGREES) -> bool:
+    """Whether two suns, directions (3,), unit, stand within so many degrees of each other: by default, whether samples of a map that was
+    drawn for the one are fresh under the other."""
+    return float(a @ b) >= math.cos(math.radians(degrees))
 
 
 def oldest_fresh(drawn_for: Sequence[Float64], to_sun: Float64) -> int:
     """Index of the first of a run of maps, oldest first, from which on each was drawn for a sun within FRESH_DEGREES of ``to_sun``."""
-    limit = math.cos(math.radians(FRESH_DEGREES))
     first = len(drawn_for)
-    while first > 0 and float(drawn_for[first - 1] @ to_sun) >= limit:
+    while first > 0 and is_near(drawn_for[first - 1], to_sun):
         first -= 1
     return first
 
 
-def box_corners(box: MovingBox) -> Float64:
-    """The twelve triangles of a box: (12, 3, 3) float64 [m], world frame."""
-    turn = math.radians(box.turned_degrees)
-    ahead, side = np.array([math.cos(turn), 0.0, -math.sin(turn)]), np.array([math.sin(turn), 0.0, math.cos(turn)])
-    axes = np.stack([ahead * box.half_size[0], np.array([0.0, box.half_size[1], 0.0]), side * box.half_size[2]])
-    triangles = []
-    for axis in range(3):
-        other, third = axes[(axis + 1) % 3], axes[(axis + 2) % 3]
-        for sign in (-1, 1):
-            a, b, c, d = (sign * axes[axis] + i * other + j * third for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1)))
-            triangles += [np.stack([a, b, c]), np.stack([a, c, d])]
-    return np.stack(triangles) + np.array(box.position)
+def box_corners(boxes: Sequence[MovingBox]) -> Float64:
+    """The corners of boxes: (b, 8, 3) float64 [m], world frame, in the order of _CORNER_SIDES."""
+    turn = np.radians([box.turned_degrees for box in boxes])
+    level = np.zeros_like(turn)
+    ahead = np.stack([np.cos(turn), level, -np.sin(turn)], axis=1)
+    side = np.stack([np.sin(turn), level, np.cos(turn)], axis=1)
+    axes = np.stack([ahead, np.broadcast_to([0.0, 1.0, 0.0], ahead.shape), side], axis=1)  # (b, 3, 3): of each its x, y, z
+    half_size = np.array([box.half_size for box in boxes]).reshape(-1, 1, 3)
+    position = np.array([box.position for box in boxes]).reshape(-1, 1, 3)
+    return np.asarray(position + (_CORNER_SIDES * half_size) @ axes)
+
+
+def box_triangles(corners: Float64) -> Float64:
+    """The twelve triangles of each box with ``corners`` (b, 8, 3) [m]: (12 b, 3, 3) float64 [m]."""
+    return corners[:, _FACE_TRIANGLES].reshape(-1, 3, 3)
 
 
 def triangle_records(corners: Float64 | Float32) -> AnyArray:

@@ -2,11 +2,11 @@
 // valid sample). Runs when a map has been drawn.
 //
 //   sun_sample[s] = share of the surfel's cell that the sun reaches, of WHOLE_SAMPLE, or NO_SAMPLE
-//   sampled_in[s] = number of the map that said so
+//   sampled_in[s] = number of the sector's look at a map that said so
 //
 // A surfel has a valid sample when all its taps lie in the map, and everything that could stand between it and the sun was drawn:
 // when its ray to the sun is above the city's top (`top`, sector-local) by where the drawn geometry ends (`reach_height` higher up).
-// Where it has none, its last sample is kept while its map is not older than `oldest_map`; then baked visibility takes over.
+// Where it has none, its last sample is kept while its look is not older than `oldest_look`; then baked visibility takes over.
 //
 // A surfel stands for a cell of some size, so SHADOW_TAPS points spread over the cell are looked up, each in the two texels of a row that
 // are nearest to it; the surfel's own plane is followed to those texels' centres, so that a slanted surface does not shade itself. Two
@@ -47,8 +47,8 @@ __kernel void sample_shadow_map(
     __global const float *map,
     const float top,
     const float reach_height,
-    const ushort this_map,
-    const ushort oldest_map,
+    const ushort this_look,
+    const ushort oldest_look,
     __global uchar8 *sun_sample,
     __global ushort8 *sampled_in)
 {
@@ -103,7 +103,7 @@ __kernel void sample_shadow_map(
     const int8 valid = covered | ~faces;
     const int8 share = (lit * WHOLE_SAMPLE + SHADOW_TAPS) / (2 * SHADOW_TAPS) & faces;
     const int8 last_number = TO_INTS(sampled_in[group]);
-    const int8 last = last_number < (int)oldest_map ? (int8)(NO_SAMPLE) : TO_INTS(sun_sample[group]);
+    const int8 last = last_number < (int)oldest_look ? (int8)(NO_SAMPLE) : TO_INTS(sun_sample[group]);
     sun_sample[group] = TO_UCHARS(valid ? share : last);
-    sampled_in[group] = TO_USHORTS(valid ? (int8)((int)this_map) : last_number);
+    sampled_in[group] = TO_USHORTS(valid ? (int8)((int)this_look) : last_number);
 }

@@ -1,8 +1,10 @@
-// What of a sector's light is shown: the artists' gains, and the fade-in of a sector that has just been loaded. Outside of the loop of
-// bounces: nothing here is fed back. A sector that needs neither is shown as it is, and has no buffer for this.
+// What of a sector's light is shown: the artists' gains, and a fade from what was shown before: what stood for a sector that has just been
+// loaded, or its own light before its sun's visibility had another source. Outside of the loop of bounces: nothing here is fed back. A
+// sector that needs neither is shown as it is, and has no buffer for this.
 //
-//   shown = faded * (first + bounce_factor * (all - first) + ambient of the probe's room)  +  (1 - faded) * placeholder     [lx]
+//   shown += share * (first + bounce_factor * (all - first) + ambient of the probe's room  -  shown)     [lx]
 //
+// A fade of n steps has the shares 1/n, 1/(n - 1) ... 1: under a light that stays, equal steps.
 // first is what one pass from darkness gives (gather_probes.cl), all the sector's own cubes. One work-item per cube face.
 //
 // Defines: CUBE_ROWS, coefficients per probe; HAS_BOUNCE_FACTOR 0 or 1: otherwise all is shown and first is not there.
@@ -22,19 +24,19 @@ __kernel void show_probes(
 #endif
     __global const ushort *probe_room,
     __constant const float4 *ambient, // of each coefficient outdoors, then indoors
-    __constant const float4 *placeholder,
-    const float faded,
+    const float share,
     __global float4 *shown)
 {
     const uint row = get_global_id(0);
     if (row >= rows)
         return;
     const uint probe = row / CUBE_ROWS, b = row % CUBE_ROWS;
+    const float4 before = shown[row];
 #if HAS_BOUNCE_FACTOR
     float4 light = first[row] + bounce_factor * (all[row] - first[row]);
 #else
     float4 light = all[row];
 #endif
     light += ambient[(probe_room[probe] != 0 ? CUBE_ROWS : 0) + b];
-    shown[row] = placeholder[b] + faded * (light - placeholder[b]);
+    shown[row] = before + share * (light - before);
 }

@@ -15,6 +15,7 @@ from server.finished_replies import AnswerFromFinished
 from server.head_requests import HeadRequests
 from server.metrics import CountRequests, Metrics
 from server.routes import (
+    boxes,
     clock,
     distant,
     health,
@@ -76,7 +77,7 @@ def app_of(service: Service) -> FastAPI:
     app.add_middleware(TellTotal)
     problems.install(app)
     stateless = (world, lighting, volume, distant, sectors, probes, preview)
-    for resource in (health, metrics_route, *stateless, clock, weather, live_settings, lights, players, player_volume, live):
+    for resource in (health, metrics_route, *stateless, clock, weather, live_settings, lights, boxes, players, player_volume, live):
         app.include_router(resource.router)
     app.router.routes.append(player_stream.route)
     app.mount("/viewer", StaticFiles(directory=VIEWER), name="viewer")

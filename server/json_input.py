@@ -1,6 +1,7 @@
 """Typed access to JSON or TOML that a user wrote: each refusal says where, what was expected, and what was found."""
 
 import math
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -8,6 +9,7 @@ from typing import Any
 from gi_core.errors import InputError
 
 _LONGEST_ECHO = 60
+_ID = re.compile(r"[A-Za-z0-9_-]{1,64}", re.ASCII)
 
 
 class Members:
@@ -50,6 +52,13 @@ class Members:
         if not isinstance(value, bool):
             raise InputError(f"{self.where}: {name}: expected true or false, found {shown(value)}")
         return value
+
+
+def identifier(value: Any, where: str) -> str:
+    """The id of a thing of the live world. Raises InputError."""
+    if not isinstance(value, str) or not _ID.fullmatch(value):
+        raise InputError(f"{where}: expected 1 to 64 letters, digits, - or _, found {shown(value)}")
+    return value
 
 
 def number(value: Any, where: str, low: float, high: float) -> float:

@@ -1,4 +1,4 @@
-"""Live edits that asked to be kept: players and lamps in a JSON file, written whole after each change, read at the next start."""
+"""Live edits that asked to be kept: players, lamps and boxes in a JSON file, written whole after each change, read at the next start."""
 
 import json
 import os
@@ -9,9 +9,10 @@ from pathlib import Path
 
 from gi_core.container import write_atomic
 from gi_core.errors import InputError
+from server.boxes_json import box_from_json, box_to_json
 from server.json_input import Members, read_text
 from server.lamps_json import lamp_from_json, lamp_to_json
-from server.live_state import LiveLamp, LiveState
+from server.live_state import LiveBox, LiveLamp, LiveState
 from server.player_paths import EyeHeight
 from server.players import Player, player_from_json
 
@@ -24,6 +25,7 @@ class Kept:
 
     players: tuple[Player, ...] = ()
     lamps: tuple[LiveLamp, ...] = ()
+    boxes: tuple[LiveBox, ...] = ()
 
 
 class KeptEdits:
@@ -50,6 +52,7 @@ class KeptEdits:
             record = {
                 "players": [entry.player.to_json() for entry in state.players.values() if entry.kept],
                 "lights": [lamp_to_json(lamp) for lamp in state.lamps.values() if lamp.kept],
+                "boxes": [box_to_json(box) for box in state.boxes.values() if box.kept],
             }
             write_atomic(self._path, (json.dumps(record, indent=1, allow_nan=False) + "\n").encode())
 
@@ -62,12 +65,15 @@ def load_kept(path: Path | None, eye_height: EyeHeight | None) -> Kept:
         record = json.loads(read_text(path, MAX_FILE_BYTES))
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: expected JSON that a server wrote ({str(error)[:200]})") from error
-    members = Members(record, str(path), ("players", "lights"))
+    members = Members(record, str(path), ("players", "lights", "boxes"))
     players = tuple(
         player_from_json(entry, f"{path}: player {i}", eye_height=eye_height) for i, entry in enumerate(_list(members, "players"))
     )
     lamps = tuple(lamp_from_json(entry, f"{path}: light {i}") for i, entry in enumerate(_list(members, "lights")))
-    return Kept(players, lamps)
+    # Servers before there were boxes wrote none.
+    records = _list(members, "boxes") if "boxes" in members else ()
+    boxes = tuple(box_from_json(entry, f"{path}: box {i}") for i, entry in enumerate(records))
+    return Kept(players, lamps, boxes)
 
 
 def _list(members: Members, name: str) -> Iterable[object]:

@@ -1,18 +1,16 @@
 """Lamps as requests and the state file write them: the fields of a world.toml's [[lamp]], an id, and how they live."""
 
-import re
 from dataclasses import asdict, fields, replace
 from typing import Any
 
 from gi_core.errors import InputError
 from gi_core.lights import check_lamp, color_from_temperature
 from gi_core.world import Lamp
-from server.json_input import Members, numbers, shown
+from server.json_input import Members, identifier, numbers, shown
 from server.live_state import LiveLamp
 
 _SHAPE = tuple(field.name for field in fields(Lamp) if field.name != "name")
 _LIFE = ("id", "dynamic", "keep")
-_ID = re.compile(r"[A-Za-z0-9_-]{1,64}", re.ASCII)
 _LARGEST = 1e12
 
 
@@ -31,9 +29,7 @@ def lamp_from_json(record: Any, where: str, *, new_id: str | None = None) -> Liv
     for name in ("kind", "position", "lumens"):
         if name not in members:
             raise InputError(f"{where}: {name}: expected one, found none")
-    given = members.value("id") if "id" in members else new_id
-    if not isinstance(given, str) or not _ID.fullmatch(given):
-        raise InputError(f"{where}: id: expected 1 to 64 letters, digits, - or _, found {shown(given)}")
+    given = identifier(members.value("id") if "id" in members else new_id, f"{where}: id")
     lamp = _changed(Lamp(given, "point", (0.0, 0.0, 0.0), 0.0), members)
     return LiveLamp(given, lamp, members.flag("dynamic", False), members.flag("keep", False))
 

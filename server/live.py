@@ -128,4 +128,5 @@ class Live:
         lamps = {**state.lamps, **{lamp.id: lamp for lamp in kept.lamps}}
         walking = {player.id: self.walking(player, 0, False) for player in players}
         walking |= {player.id: self.walking(player, 0, True) for player in kept.players}
-        return replace(state, lamps=MappingProxyType(lamps), players=MappingProxyType(walking))
+        boxes = {box.id: box for box in kept.boxes}
+        return replace(state, lamps=MappingProxyType(lamps), boxes=MappingProxyType(boxes), players=MappingProxyType(walking))

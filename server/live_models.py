@@ -69,6 +69,23 @@ class LightsReply(BaseModel):
     tick: int = _TICK
 
 
+class Box(BaseModel):
+    id: str
+    position: Vector3 = Field(description="of its middle, world metres")
+    half_size: Vector3 = Field(description="along its own axes [m]")
+    turned_degrees: float = Field(description="about the vertical, from +X towards -Z")
+    keep: bool
+
+
+class BoxReply(Box):
+    tick: int = _TICK
+
+
+class BoxesReply(BaseModel):
+    boxes: list[Box]
+    tick: int = _TICK
+
+
 class Whereabouts(BaseModel):
     id: str
     position: Vector3 = Field(description="world metres")
@@ -159,6 +176,7 @@ class LiveReply(BaseModel):
     waiting: int = Field(description="volumes that wait for another tick")
     players: int
     lamps: int
+    boxes: int
     jumps: int = Field(description="changes of clock, weather and settings at once, which light follows at once")
     streams: Streams
     memory_bytes: int | None

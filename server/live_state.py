@@ -1,4 +1,4 @@
-"""What the live world is told to be: clock, weather, settings, lamps, players. Immutable; commands make another state of it.
+"""What the live world is told to be: clock, weather, settings, lamps, boxes, players. Immutable; commands make another state of it.
 
 Requests don't change the world: they hand in commands, which the ticker applies in order between two ticks. So a tick sees one state,
 and a command either takes effect whole, from the tick that its reply names, or not at all.
@@ -7,6 +7,7 @@ and a command either takes effect whole, from the tick that its reply names, or 
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from types import MappingProxyType
 from typing import Any
 
@@ -20,11 +21,13 @@ from server.players import MAX_PLAYERS, Player
 from server.world_clock import WorldClock
 
 MAX_LAMPS = 20_000
+# Their triangles, twelve each, are drawn in one tick, at half a millisecond a thousand.
+MAX_BOXES = 256
 _NOT_OF_IDS = re.compile(r"[^A-Za-z0-9_-]+")
 
 
 class NoSuchThingError(InputError, LookupError):
-    """A player or a lamp that is not there: HTTP 404."""
+    """A player, a lamp or a box that is not there: HTTP 404."""
 
     code = "no_such_id"
 
@@ -60,6 +63,15 @@ class LiveLamp:
     kept: bool = False
 
 
+@dataclass(frozen=True)
+class LiveBox:
+    """A moving box of the live world. kept : written to the state file, and back after a restart"""
+
+    id: str
+    box: MovingBox
+    kept: bool = False
+
+
 @dataclass(frozen=True, eq=False)
 class LivePlayer:
     """A simulated player and the walk it is on since a tick."""
@@ -79,8 +91,13 @@ class LiveState:
     settings: Settings = NEUTRAL
     lamps: Mapping[str, LiveLamp] = field(default_factory=lambda: MappingProxyType({}))
     players: Mapping[str, LivePlayer] = field(default_factory=lambda: MappingProxyType({}))
-    boxes: tuple[MovingBox, ...] = ()
+    boxes: Mapping[str, LiveBox] = field(default_factory=lambda: MappingProxyType({}))
     jumps: int = 0
+
+    @cached_property
+    def moving_boxes(self) -> tuple[MovingBox, ...]:
+        """The boxes as ticks take them, the same tuple each time: another is looked at anew."""
+        return tuple(entry.box for entry in self.boxes.values())
 
     def with_player(self, added: LivePlayer) -> "LiveState":
         """Another player. Raises TakenIdError, and InputError when there are too many."""
@@ -108,6 +125,20 @@ class LiveState:
         """One lamp less. Raises NoSuchThingError."""
         return replace(self, lamps=_without(self.lamps, name, "light"))
 
+    def with_box(self, box: LiveBox, new: bool) -> "LiveState":
+        """Another box, or one changed. Raises TakenIdError, NoSuchThingError, and InputError when there are too many."""
+        if new and box.id in self.boxes:
+            raise TakenIdError(f"box {box.id!r}: expected a new id, found one in use; PATCH changes a box")
+        if not new and box.id not in self.boxes:
+            raise _missing(box.id, "box")
+        if len(self.boxes) >= MAX_BOXES and new:
+            raise InputError(f"boxes: expected at most {MAX_BOXES}, found as many already")
+        return replace(self, boxes=MappingProxyType({**self.boxes, box.id: box}))
+
+    def without_box(self, name: str) -> "LiveState":
+        """One box less. Raises NoSuchThingError."""
+        return replace(self, boxes=_without(self.boxes, name, "box"))
+
     def with_clock(self, clock: WorldClock, is_jump: bool) -> "LiveState":
         """Another clock."""
         return replace(self, clock=clock, jumps=self.jumps + is_jump)
@@ -125,6 +156,12 @@ class LiveState:
         if name not in self.lamps:
             raise _missing(name, "light")
         return self.lamps[name]
+
+    def box(self, name: str) -> LiveBox:
+        """A box by its id. Raises NoSuchThingError."""
+        if name not in self.boxes:
+            raise _missing(name, "box")
+        return self.boxes[name]
 
     def player(self, name: str) -> LivePlayer:
         """A player by its id. Raises NoSuchThingError."""

@@ -16,7 +16,6 @@ A players file is a JSON list of objects, or TOML with a [[player]] for each:
 """
 
 import json
-import re
 import tomllib
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
@@ -27,7 +26,7 @@ from gi_core.container import write_atomic
 from gi_core.dataset import Dataset
 from gi_core.errors import InputError
 from gi_core.json_fields import LARGEST_INTEGER
-from server.json_input import Members, numbers, read_text, shown
+from server.json_input import Members, identifier, numbers, read_text, shown
 from server.path_walk import PathWalk, Point
 from server.player_paths import MAX_COORDINATE_M, EyeHeight, points_from_json, read_path_file
 from server.street_lattice import StreetLattice
@@ -37,7 +36,6 @@ MAX_PLAYERS = 1000
 MAX_SPEED_M_S = 200.0
 MAX_DWELL_S = 3600.0
 MAX_FILE_BYTES = 1 << 26
-_ID = re.compile(r"[A-Za-z0-9_-]{1,64}", re.ASCII)
 
 
 @dataclass(frozen=True)
@@ -77,9 +75,7 @@ def player_from_json(
     folder : where files that ``path`` may name lie; without it (requests from outside) no path may be a file
     """
     members = Members(record, where, Player.__dataclass_fields__)
-    name = members.value("id") if "id" in members else new_id
-    if not isinstance(name, str) or not _ID.fullmatch(name):
-        raise InputError(f"{where}: id: expected 1 to 64 letters, digits, - or _, found {shown(name)}")
+    name = identifier(members.value("id") if "id" in members else new_id, f"{where}: id")
     shortest, longest = numbers(members.value("pause_s"), f"{where}: pause_s", 2, 0.0, MAX_DWELL_S) if "pause_s" in members else (0.0, 0.0)
     if shortest > longest:
         raise InputError(f"{where}: pause_s: expected the shortest first, found {shown([shortest, longest])}")

@@ -158,7 +158,7 @@ class Ticker:
             players = players_at(self.state.players, number, self.rate_hz)
             lit = time.perf_counter()
             left_ms = FILL_UNTIL * period_s * 1e3 - (lit - begun) * 1e3
-            report = self.world.tick(number, players, light, self.state.boxes, left_ms)
+            report = self.world.tick(number, players, light, self.state.moving_boxes, left_ms)
             report.ms["light"] = (lit - begun) * 1e3
         except Exception as error:
             # The world goes on: the next tick may do what this one could not.

@@ -64,6 +64,7 @@ def live_facts(service: Service, ticker: Ticker) -> dict[str, Any]:
         "waiting": stats.waiting,
         "players": len(state.players),
         "lamps": len(state.lamps),
+        "boxes": len(state.boxes),
         "jumps": state.jumps,
         "streams": {"clients": streams.clients, "frames": streams.counts.frames, "bytes": streams.counts.bytes},
         "memory_bytes": memory_bytes(),

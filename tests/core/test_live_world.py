@@ -1,10 +1,11 @@
 """The live world tick by tick: it settles to what a query gives, forgets what was, never pops, and lives with what cannot be loaded."""
 
 import shutil
+import threading
 import time
 from dataclasses import replace
 from datetime import datetime
-from itertools import count
+from itertools import count, pairwise
 from pathlib import Path
 from threading import Lock
 from types import SimpleNamespace
@@ -12,7 +13,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from gi_core.constants import VOXEL_SIZE_M
+from gi_core.constants import VOXEL_INDOORS, VOXEL_OUTDOORS, VOXEL_SIZE_M
 from gi_core.dataset import Dataset, sector_path
 from gi_core.device import Device, shared_device
 from gi_core.engine import Engine
@@ -23,12 +24,14 @@ from gi_core.light_geometry import ShadowGeometry
 from gi_core.lighting import Lighting
 from gi_core.lights import lamps_on
 from gi_core.live_sector import FADE_TICKS, LiveLight, LiveSector
+from gi_core.live_volume import PublishedVolume
 from gi_core.live_volumes import HELD_TICKS
 from gi_core.live_world import LiveWorld, TickPlayers, TickReport
 from gi_core.relight import Relighter
 from gi_core.relight_input import relight_input
 from gi_core.resident_sector import ResidentSector
 from gi_core.settings import NEUTRAL, Settings
+from gi_core.shadow_plan import LOWEST_SUN_DEGREES, is_near
 from gi_core.stream_plan import StreamOptions
 from gi_core.world import Lamp
 
@@ -67,6 +70,16 @@ def light_of(
 def at(*places: np.ndarray, velocity=(0.0, 0.0, 0.0)) -> TickPlayers:
     positions = np.array(places, np.float64).reshape(-1, 3)
     return TickPlayers(tuple(f"p{i}" for i in range(len(places))), positions, np.tile(np.array(velocity, np.float64), (len(places), 1)))
+
+
+def largest_step(before: PublishedVolume, after: PublishedVolume) -> float:
+    """By how much light [lx] changed in any voxel of free air that two volumes share; the second lies as far along x or further."""
+    shift = after.first_voxel - before.first_voxel
+    assert shift[0] >= 0
+    assert not shift[1:].any()
+    count = before.values.shape[3] - int(shift[0])
+    change = np.abs(after.values[:, :, :, :count] - before.values[:, :, :, -count:]).max(axis=(0, 4))
+    return float(change[np.isin(after.mask[:, :, :count], (VOXEL_OUTDOORS, VOXEL_INDOORS))].max())
 
 
 def is_exact(world: LiveWorld) -> bool:
@@ -530,6 +543,22 @@ def test_warming_up_changes_no_light(world, engine):
     np.testing.assert_array_equal(found, engine.volume(STREET, lighting).values)
 
 
+def test_warming_up_reads_no_voxel_beyond_the_sector(world, monkeypatch):
+    read = []
+
+    def fill(sector, box, size, *_):
+        level = [0, 2]  # heights are clamped
+        first = box["sector_first"][0, level]
+        read.append((first, first + box["box_size"][0, level], box["sector_size"][0, level]))
+
+    monkeypatch.setattr(ResidentSector, "fill_volume", fill)
+    world.warm_up()
+    assert read
+    for first, end, held in read:
+        assert (first >= 0).all()
+        assert (end <= held).all()
+
+
 def test_a_shadow_map_is_drawn_around_players_and_used(engine):
     world = LiveWorld(Dataset.open(GOLDEN))
     try:
@@ -546,6 +575,141 @@ def test_a_shadow_map_is_drawn_around_players_and_used(engine):
         np.testing.assert_array_equal(run.settle(at(STREET), light), by_day)
     finally:
         world.close()
+
+
+@pytest.fixture
+def shaded():
+    """A world with a shadow map, and an event: until that is set, nothing is read for the map."""
+    made = LiveWorld(Dataset.open(GOLDEN))
+    read, may_read = made._shadows._read, threading.Event()
+    made._shadows._read = lambda index: may_read.wait(LATE_S) and read(index)
+    yield made, may_read
+    may_read.set()
+    made.close()
+
+
+def sampled(world: LiveWorld, count: int = 2) -> bool:
+    """Whether as many sectors are resident, and each has samples that are bound."""
+    residents = world.streamer.residents.values()
+    return len(residents) == count and all(s.sampled_of and s.resident.sun_sample for s in residents)
+
+
+def unbound(world: LiveWorld) -> bool:
+    """Whether no resident sector has samples that are bound."""
+    return all(s.sampled_of is None and s.resident.sun_sample is None for s in world.streamer.residents.values())
+
+
+def test_nothing_pops_on_a_walk_when_the_shadow_map_takes_over(shaded, engine):
+    """What each sector shows goes over from baked visibility to the map's: no voxel moves by more than a share of the way in a tick."""
+    world, may_read = shaded
+    run, lighting = Run(world), engine.lighting("15:00", "clear")
+    light = light_of(world, lighting, standing=False)
+    places = [STREET + EAST * x for x in np.arange(-20.0, 30.0, 0.4)]
+    run.settle(at(places[0]), light_of(world, lighting))
+    frames = [world.published("p0")]
+    may_read.set()
+    for place in places:
+        run.tick(at(place), light)
+        frames.append(world.published("p0"))
+        time.sleep(0.002)
+    assert sampled(world)
+    assert len({frame.first_voxel[0] for frame in frames}) > 10
+    whole_way = max(
+        np.abs(run.settle(at(place), light_of(world, lighting)) - engine.volume(place, lighting).values).max()
+        for place in (places[0], places[-1])
+    )
+    largest = max(largest_step(before, after) for before, after in pairwise(frames))
+    # A step of the fade, and what the light itself still moves by while it settles.
+    assert 0.5 * whole_way / FADE_TICKS <= largest <= 1.5 * whole_way / FADE_TICKS
+
+
+def test_nothing_pops_when_samples_grow_too_old(shaded, engine, monkeypatch):
+    world, may_read = shaded
+    may_read.set()
+    run, lighting = Run(world), engine.lighting("2024-06-21T15:00:00", "clear")
+    run.until(at(STREET), light_of(world, lighting), lambda r: sampled(world))
+    whole_way = np.abs(run.settle(at(STREET), light_of(world, lighting)) - engine.volume(STREET, lighting).values).max()
+    monkeypatch.setattr(world._shadows, "_plan", lambda *_: None)  # as if other players took all of its time
+    steps = {True: [], False: []}
+    frame = world.volumes.of_player["p0"].published
+    for seconds in range(0, 480, 5):
+        moved = light_of(world, engine.lighting(f"2024-06-21T15:{seconds // 60:02d}:{seconds % 60:02d}", "clear"), standing=False)
+        run.tick(at(STREET), moved)
+        last, frame = frame, world.volumes.of_player["p0"].published
+        steps[sampled(world)].append(largest_step(last, frame))
+    assert unbound(world)
+    assert len(steps[True]) > 10 < len(steps[False])
+    assert max(steps[False]) <= 1.5 * max(steps[True]) + 1.5 * whole_way / FADE_TICKS
+
+
+def test_a_clock_that_jumps_leaves_no_old_samples_bound(shaded, engine):
+    world, may_read = shaded
+    may_read.set()
+    run, afternoon = Run(world), light_of(world, engine.lighting("15:00", "clear"))
+    run.until(at(STREET), afternoon, lambda r: sampled(world))
+    run.settle(at(STREET), afternoon)
+    may_read.clear()
+    world._shadows._casters.clear()
+    morning = light_of(world, engine.lighting("09:00", "clear"), standing=False)
+    residents = world.streamer.residents
+
+    def fresh(report: TickReport) -> bool:
+        for index in report.relit:
+            of = residents[index].sampled_of
+            assert of is None or is_near(of.to_sun, morning.to_sun)
+        return sampled(world)
+
+    assert not fresh(run.tick(at(STREET), morning))
+    assert unbound(world)
+    # It follows at once, without a fade; and what it shows then has nothing of the afternoon.
+    assert not any(sector.is_fading for sector in residents.values())
+    may_read.set()
+    run.until(at(STREET), morning, fresh)
+    np.testing.assert_array_equal(run.settle(at(STREET), light_of(world, engine.lighting("09:00", "clear"))), fresh_volume("09:00", engine))
+
+
+def fresh_volume(time_of_day: str, engine: Engine) -> np.ndarray:
+    """What a world that has known no other hour shows of the street, with a shadow map."""
+    world = LiveWorld(Dataset.open(GOLDEN))
+    try:
+        run, light = Run(world), light_of(world, engine.lighting(time_of_day, "clear"))
+        run.until(at(STREET), light, lambda r: sampled(world))
+        return run.settle(at(STREET), light)
+    finally:
+        world.close()
+
+
+def test_samples_that_a_player_has_left_behind_grow_old(shaded, engine):
+    world, may_read = shaded
+    may_read.set()
+    run, evening = Run(world), engine.lighting("17:00", "clear")
+    run.until(at(STREET), light_of(world, engine.lighting("15:00", "clear")), lambda r: sampled(world))
+    run.until(at(), light_of(world, evening), lambda r: unbound(world) and is_exact(world))
+    assert len(world.streamer.residents) == 2
+    # Whoever comes then sees the bake's visibility, as a query does, until there is a map.
+    may_read.clear()
+    world._shadows._casters.clear()
+    run.until(at(STREET), light_of(world, evening), lambda r: r.filled)
+    np.testing.assert_array_equal(world.volumes.of_player["p0"].published.values, engine.volume(STREET, evening).values)
+
+
+def test_a_sun_below_a_degree_is_the_bakes_once_its_samples_are_old(shaded, engine):
+    world, may_read = shaded
+    may_read.set()
+    evening = [engine.lighting(f"2024-06-21T{minute // 60}:{minute % 60:02d}:00", "clear") for minute in range(19 * 60, 22 * 60)]
+    is_higher = np.array([light.sun.direction[1] > np.sin(np.radians(LOWEST_SUN_DEGREES)) for light in evening])
+    last = int(is_higher.argmin()) - 1
+    # The sun goes 15 degrees in an hour: three minutes later samples are fresh, five minutes later they are not.
+    before, fresh, old = (evening[last + minutes] for minutes in (0, 3, 5))
+    assert old.sun.irradiance.any()
+    run = Run(world)
+    run.until(at(STREET), light_of(world, before), lambda r: sampled(world))
+    for _ in range(4):
+        run.tick(at(STREET), light_of(world, fresh, standing=False))
+    assert sampled(world)
+    found = run.settle(at(STREET), light_of(world, old))
+    assert unbound(world)
+    np.testing.assert_array_equal(found, engine.volume(STREET, old).values)
 
 
 def test_a_running_clock_is_followed(world, engine):

@@ -13,6 +13,7 @@ import pytest
 
 from gi_core.errors import InputError
 from server.app import create_app
+from server.kept_edits import load_kept
 from server.live import LiveOptions
 from server.settings import Settings
 
@@ -57,6 +58,9 @@ def test_writes_want_the_token_and_reads_do_not(city: Path, tmp_path: Path, serv
             ("POST", "/v1/lights"),
             ("PATCH", "/v1/lights/a"),
             ("DELETE", "/v1/lights/a"),
+            ("POST", "/v1/boxes"),
+            ("PATCH", "/v1/boxes/a"),
+            ("DELETE", "/v1/boxes/a"),
             ("POST", "/v1/players"),
             ("DELETE", "/v1/players/a"),
         ]
@@ -82,6 +86,7 @@ def test_what_is_kept_is_there_after_a_restart(
     options = LiveOptions(ticks_per_second=10, state_file=tmp_path / "state.json")
     kept = {"id": "kept", "path": [street], "speed": 0, "keep": True}
     lamp = {"id": "kept", "kind": "point", "position": list(street), "lumens": 500, "keep": True}
+    box = {"id": "kept", "position": list(street), "half_size": [2, 1, 1], "keep": True}
     with serving(create_app(city, Settings(live=options))) as http:
         wait_until_live(http)
         authored = http.get("/v1/lights").json()["lights"][0]["id"]
@@ -89,6 +94,9 @@ def test_what_is_kept_is_there_after_a_restart(
         assert http.post("/v1/players", json=kept | {"id": "passing", "keep": False}).status_code == 201
         assert http.post("/v1/players", json=kept | {"id": "deleted"}).status_code == 201
         assert http.delete("/v1/players/deleted").status_code == 200
+        assert http.post("/v1/boxes", json=box).status_code == 201
+        assert http.post("/v1/boxes", json=box | {"id": "passing", "keep": False}).status_code == 201
+        assert http.patch("/v1/boxes/kept", json={"turned_degrees": 45}).status_code == 200
         assert http.post("/v1/lights", json=lamp).status_code == 201
         assert http.post("/v1/lights", json=lamp | {"id": "passing", "keep": False}).status_code == 201
         assert http.patch("/v1/lights/kept", json={"lumens": 600}).status_code == 200
@@ -97,14 +105,20 @@ def test_what_is_kept_is_there_after_a_restart(
         assert http.get("/v1/players").status_code in (200, 503)  # it started at once: somebody walks
         wait_until_live(http)
         assert [p["id"] for p in http.get("/v1/players").json()["players"]] == ["kept"]
+        assert http.get("/v1/boxes").json()["boxes"] == [{**box, "turned_degrees": 45.0}]
         lights = {light["id"]: light["lumens"] for light in http.get("/v1/lights").json()["lights"]}
         assert lights["kept"] == 600
         assert lights[authored] == 7
         assert "passing" not in lights
         assert http.patch("/v1/lights/kept", json={"keep": False}).status_code == 200
         assert http.delete("/v1/players/kept").status_code == 200
-    assert json.loads(options.state_file.read_text())["players"] == []
-    assert [light["id"] for light in json.loads(options.state_file.read_text())["lights"]] == [authored]
+    record = json.loads(options.state_file.read_text())
+    assert record["players"] == []
+    assert [light["id"] for light in record["lights"]] == [authored]
+    # A file from before there were boxes is read as well.
+    del record["boxes"]
+    options.state_file.write_text(json.dumps(record))
+    assert load_kept(options.state_file, None).boxes == ()
 
 
 def test_nothing_is_kept_without_a_file_and_that_is_said(city: Path, serving: Serving, problem_of: ProblemOf, street: Any) -> None:

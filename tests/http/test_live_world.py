@@ -10,6 +10,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+from fastapi import FastAPI
 
 ProblemOf = Callable[[httpx.Response], dict[str, Any]]
 PATIENCE_S = 20.0  # the machine may be busy
@@ -138,6 +139,44 @@ def test_a_light_that_moves_changes_what_a_player_sees(
     assert live_http.get("/v1/lights/moving").status_code == 404
 
 
+def test_a_box_beside_a_lit_place_shades_it(
+    live_app: FastAPI, live_http: httpx.Client, still: None, player: str, street: tuple[float, ...]
+) -> None:
+    residents = live_app.state.service.live.ticker.world.streamer.residents
+
+    def brightness() -> float:
+        """What arrives from below, a metre or two around the player: the sun's, off the street."""
+        return float(light_at(live_http, player)[3, 7:9, 15:17, 15:17].mean())
+
+    def settled() -> float | None:
+        seen = [brightness()]
+        for _ in range(4):
+            time.sleep(0.2)
+            seen.append(brightness())
+        by_map = residents and all(sector.sampled_of for sector in residents.values())
+        return seen[0] if by_map and max(seen) == min(seen) else None
+
+    live_http.put("/v1/clock", json={"time": "2024-06-21T13:00"})  # high enough for the street
+    before = until(settled)
+    to_sun = np.array(live_http.get("/v1/lighting", params={"time": "2024-06-21T13:00", "weather": "clear"}).json()["sun"]["direction"])
+    beside = np.array(street) + 25 * to_sun
+    box = {"id": "truck", "position": beside.tolist(), "half_size": [12, 4, 12]}
+    made = live_http.post("/v1/boxes", json=box)
+    assert (made.status_code, made.headers["location"]) == (201, "/v1/boxes/truck")
+    assert made.json() == {**box, "turned_degrees": 0.0, "keep": False, "tick": made.json()["tick"]}
+    shaded = until(lambda: (now := brightness()) < 0.7 * before and now)
+    assert live_http.get("/v1/live").json()["tick"] - made.json()["tick"] < 100  # five on a machine with nothing else to do
+    # Driven away, it takes its shadow along.
+    away = beside + np.array([0.0, 0.0, 300.0])
+    moved = live_http.patch("/v1/boxes/truck", json={"position": away.tolist()}).json()
+    assert (moved["half_size"], moved["position"]) == ([12, 4, 12], away.tolist())
+    until(lambda: brightness() > shaded + 0.5 * (before - shaded))
+    assert until(settled) == before
+    assert [b["id"] for b in live_http.get("/v1/boxes").json()["boxes"]] == ["truck"]
+    assert live_http.delete("/v1/boxes/truck").json()["id"] == "truck"
+    assert live_http.get("/v1/boxes").json()["boxes"] == []
+
+
 def test_lamps_of_the_dataset_are_there_and_can_be_changed(live_http: httpx.Client) -> None:
     lamps = live_http.get("/v1/lights").json()["lights"]
     assert lamps
@@ -190,6 +229,11 @@ REFUSED: list[tuple[str, str, Any, str]] = [
     ("POST", "/v1/lights", {"kind": "point"}, "position"),
     ("POST", "/v1/lights", {"kind": "moon", "position": [0, 0, 0], "lumens": 1}, "kind"),
     ("POST", "/v1/lights", {"id": "a b", "kind": "point", "position": [0, 0, 0], "lumens": 1}, "id"),
+    ("POST", "/v1/boxes", {"position": [0, 0, 0]}, "half_size"),
+    ("POST", "/v1/boxes", {"position": [0, 1e9, 0], "half_size": [1, 1, 1]}, "position"),
+    ("POST", "/v1/boxes", {"position": [0, 0, 0], "half_size": [1, 0, 1]}, "half_size"),
+    ("POST", "/v1/boxes", {"position": [0, 0, 0], "half_size": [1, 1, 1], "turned_degrees": float("nan")}, "turned_degrees"),
+    ("POST", "/v1/boxes", {"id": "", "position": [0, 0, 0], "half_size": [1, 1, 1]}, "id"),
     ("POST", "/v1/players", {"path": []}, "path"),
     ("POST", "/v1/players", {"path": "players.json"}, "path"),
     ("POST", "/v1/players", {"speed": 1000}, "speed"),
@@ -202,7 +246,7 @@ def test_bad_bodies_are_named_alike_and_change_nothing(
     live_http: httpx.Client, problem_of: ProblemOf, still: None, method: str, path: str, body: Any, named: str
 ) -> None:
     def state() -> list[Any]:
-        found = [live_http.get(f"/v1/{name}").json() for name in ("clock", "weather", "settings", "lights", "players")]
+        found = [live_http.get(f"/v1/{name}").json() for name in ("clock", "weather", "settings", "lights", "boxes", "players")]
         for reply in found:
             reply.pop("tick")
         return found
@@ -222,10 +266,14 @@ def test_ids_that_are_not_there_or_taken(live_http: httpx.Client, problem_of: Pr
         ("DELETE", "/v1/players/no"),
         ("GET", "/v1/players/no/volume"),
         ("GET", "/v1/lights/no"),
+        ("GET", "/v1/boxes/no"),
+        ("DELETE", "/v1/boxes/no"),
     ):
         reply = live_http.request(method, path)
         assert (reply.status_code, problem_of(reply)["code"]) == (404, "no_such_id")
     reply = live_http.patch("/v1/lights/no", json={"lumens": 1})
+    assert (reply.status_code, problem_of(reply)["code"]) == (404, "no_such_id")
+    reply = live_http.patch("/v1/boxes/no", json={"position": [0, 0, 0]})
     assert (reply.status_code, problem_of(reply)["code"]) == (404, "no_such_id")
     reply = live_http.post("/v1/players", json={"id": player, "path": [street]})
     assert (reply.status_code, problem_of(reply)["code"]) == (409, "id_taken")

@@ -7,8 +7,18 @@ from types import MappingProxyType, SimpleNamespace
 import pytest
 
 from gi_core.errors import InputError
+from gi_core.shadow_plan import MovingBox
 from gi_core.world import Lamp, Location
-from server.live_state import LiveLamp, LiveState, LiveUnavailableError, NoSuchThingError, authored_lamps
+from server.live_state import (
+    MAX_BOXES,
+    LiveBox,
+    LiveLamp,
+    LiveState,
+    LiveUnavailableError,
+    NoSuchThingError,
+    TakenIdError,
+    authored_lamps,
+)
 from server.live_weather import fixed_weather
 from server.ticker import Ticker
 from server.world_clock import starting_clock
@@ -106,3 +116,16 @@ def test_authored_lamps_have_distinct_ids_that_fit_into_paths() -> None:
 def test_a_lamp_that_is_there_is_no_new_one(ticker: Ticker) -> None:
     with pytest.raises(InputError, match="PATCH"):
         ticker.state.with_lamp(lamp("lamp1"), new=True)
+
+
+def test_there_are_no_more_boxes_than_a_tick_can_draw(ticker: Ticker) -> None:
+    state = ticker.state
+    for number in range(MAX_BOXES):
+        state = state.with_box(LiveBox(f"box{number}", MovingBox((number, 0.0, 0.0), (1.0, 1.0, 1.0))), new=True)
+    with pytest.raises(InputError, match=f"at most {MAX_BOXES}"):
+        state.with_box(LiveBox("another", MovingBox((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))), new=True)
+    moved = state.with_box(LiveBox("box7", MovingBox((0.0, 5.0, 0.0), (1.0, 1.0, 1.0))), new=False)
+    assert [box.position for box in moved.moving_boxes[6:9]] == [(6, 0, 0), (0, 5, 0), (8, 0, 0)]
+    assert moved.moving_boxes is moved.moving_boxes
+    with pytest.raises(TakenIdError):
+        moved.without_box("box0").with_box(LiveBox("box7", moved.box("box7").box), new=True)

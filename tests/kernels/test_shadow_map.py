@@ -10,8 +10,18 @@ from gi_core.device import Device, available_devices, describe, shared_device
 from gi_core.grid import SectorIndex
 from gi_core.layout import NO_SAMPLE, WHOLE_SAMPLE
 from gi_core.resident_sector import ResidentSector
-from gi_core.shadow_map import ShadowMap, SunSamples
-from gi_core.shadow_plan import MAP_TEXELS, MovingBox, box_corners, oldest_fresh, plan_map, sun_or_box_moved, triangle_records
+from gi_core.shadow_map import LAST_NUMBER, ShadowMap, SunSamples
+from gi_core.shadow_plan import (
+    MAP_TEXELS,
+    NO_BOXES,
+    MovingBox,
+    box_corners,
+    box_triangles,
+    oldest_fresh,
+    plan_map,
+    sun_or_box_moved,
+    triangle_records,
+)
 
 ZERO = SectorIndex(0, 0)
 MIDDLE = np.array([32.0, 2.0, 32.0])
@@ -30,7 +40,7 @@ def towards(elevation_degrees: float, azimuth_degrees: float = 25.0) -> np.ndarr
 
 def drawn(device: Device, corners: np.ndarray, to_sun: np.ndarray, boxes=(), position=MIDDLE) -> ShadowMap:
     shadow_map = ShadowMap(device, lambda _: triangle_records(corners), TOP)
-    plan = plan_map(position, to_sun, {ZERO}, 0.0, TOP, boxes)
+    plan = plan_map(position, to_sun, {ZERO}, 0.0, TOP, box_corners(boxes))
     assert plan is not None
     shadow_map.begin(plan)
     while not shadow_map.draw(10):
@@ -46,7 +56,7 @@ def random_city(seed: int) -> np.ndarray:
     ]
     loose = rng.uniform(0, 60, (40, 1, 3)) + rng.normal(0, 4, (40, 3, 3))
     ground = np.array([[[-50.0, 0, -50], [150, 0, -50], [150, 0, 150]], [[-50, 0, -50], [150, 0, 150], [-50, 0, 150]]])
-    return np.concatenate([*(box_corners(box) for box in boxes), loose, ground])
+    return np.concatenate([box_triangles(box_corners(boxes)), loose, ground])
 
 
 @pytest.mark.parametrize("elevation", [90.0, 62.0, 30.0, 6.0])
@@ -108,7 +118,7 @@ def test_samples_equal_their_twin(device, make_sector, elevation):
 
 def test_a_floor_in_the_open_is_lit_and_one_under_a_roof_is_not(device, make_sector):
     ground = random_city(1)[-2:]
-    roof = box_corners(MovingBox((32.0, 10.0, 32.0), (8.0, 0.5, 8.0)))
+    roof = box_triangles(box_corners([MovingBox((32.0, 10.0, 32.0), (8.0, 0.5, 8.0))]))
     shadow_map = drawn(device, np.concatenate([ground, roof]), towards(60.0))
     up = np.tile(np.float32([0, 1, 0]), (2000, 1))
     samples = samples_of(device, make_sector, 5, surfel_normal=up)
@@ -164,6 +174,39 @@ def test_each_surfel_knows_its_source(device, make_sector):
     assert (gone[facing] == NO_SAMPLE).all()
 
 
+def test_samples_grow_old_between_looks(device, make_sector):
+    shadow_map = drawn(device, random_city(3), towards(50.0))
+    samples = samples_of(device, make_sector, 5)
+    assert not samples.forget_old(towards(50.0))  # there are none
+    shadow_map.sample(samples)
+    # The next map covers none of the surfels: most samples are of the first look, the second's are of surfels that face away.
+    shadow_map.begin(plan_map(MIDDLE + np.array([2000.0, 0, 0]), towards(50.8), {ZERO}, 0.0, TOP))
+    shadow_map.draw(1)
+    shadow_map.sample(samples)
+    before, number = samples.read()
+    assert {1, 2} <= set(number[before != NO_SAMPLE].tolist())
+    assert not samples.forget_old(towards(50.9))
+    assert samples.forget_old(towards(51.2))
+    after, _ = samples.read()
+    assert (after[number < 2] == NO_SAMPLE).all()
+    np.testing.assert_array_equal(after[number == 2], before[number == 2])
+    assert samples.are_there
+    assert samples.forget_old(towards(30.0))
+    assert not samples.are_there
+    assert (samples.read()[0] == NO_SAMPLE).all()
+
+
+def test_samples_start_anew_when_looks_run_out_of_numbers(device, make_sector):
+    shadow_map = drawn(device, random_city(3), towards(50.0))
+    samples, other = samples_of(device, make_sector, 5), samples_of(device, make_sector, 5)
+    samples.number = LAST_NUMBER - 1
+    for number in (LAST_NUMBER, 1):
+        shadow_map.sample(samples)
+        assert samples.number == number
+    shadow_map.sample(other)
+    np.testing.assert_array_equal(samples.read(), other.read())
+
+
 def test_a_ray_that_leaves_what_was_drawn_below_the_roofs_is_not_valid(device, make_sector):
     shadow_map = ShadowMap(device, lambda _: triangle_records(random_city(3)), 2000.0)
     plan = plan_map(MIDDLE, towards(10.0), {ZERO}, 0.0, 2000.0)
@@ -177,13 +220,31 @@ def test_a_ray_that_leaves_what_was_drawn_below_the_roofs_is_not_valid(device, m
 
 
 def test_a_map_is_planned_anew_when_sun_or_box_have_moved_enough():
-    plan = plan_map(MIDDLE, towards(50.0), {ZERO}, 0.0, TOP, (MovingBox((0, 0, 0), (1, 1, 1)),))
-    box = (MovingBox((0.3, 0, 0), (1, 1, 1)),)
-    assert not sun_or_box_moved(plan, towards(50.1), box)
-    assert sun_or_box_moved(plan, towards(50.3), box)
-    assert sun_or_box_moved(plan, towards(50.0), (MovingBox((0.6, 0, 0), (1, 1, 1)),))
-    assert sun_or_box_moved(plan, towards(50.0), ())
+    def moved(elevation: float, *boxes: MovingBox) -> bool:
+        return sun_or_box_moved(plan, towards(elevation), box_corners(boxes))
+
+    van = MovingBox((0, 0, 0), (3, 1, 1))
+    plan = plan_map(MIDDLE, towards(50.0), {ZERO}, 0.0, TOP, box_corners([van]))
+    assert not moved(50.1, replace(van, position=(0.3, 0, 0)))
+    assert moved(50.3, van)
+    assert moved(50.0, replace(van, position=(0.6, 0, 0)))
+    assert moved(50.0)
+    # What turns or grows in place casts another shadow, too.
+    assert moved(50.0, replace(van, turned_degrees=90.0))
+    assert moved(50.0, replace(van, half_size=(9, 3, 3)))
+    assert not moved(50.0, replace(van, turned_degrees=5.0))  # its corners are 0.28 m further
     assert plan_map(MIDDLE, towards(0.5), {ZERO}, 0.0, TOP) is None
+
+
+def test_a_box_has_its_corners_and_twelve_triangles():
+    corners = box_corners([MovingBox((10, 2, 5), (3, 1, 0.5), 90.0), MovingBox((0, 0, 0), (1, 2, 3))])
+    np.testing.assert_allclose(corners[0].min(axis=0), [9.5, 1, 2], atol=1e-12)
+    np.testing.assert_allclose(corners[0].max(axis=0), [10.5, 3, 8], atol=1e-12)
+    a, b, c = np.moveaxis(box_triangles(corners), 1, 0)
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1).reshape(2, 12).sum(axis=1) / 2
+    np.testing.assert_allclose(area, [2 * (6 * 2 + 6 * 1 + 2 * 1), 2 * (2 * 4 + 2 * 6 + 4 * 6)])
+    assert box_triangles(NO_BOXES).shape == (0, 3, 3)
+    np.testing.assert_array_equal(box_corners([]), NO_BOXES)
 
 
 def test_sectors_towards_the_sun_are_drawn_and_others_are_not():
