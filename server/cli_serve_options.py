@@ -24,7 +24,7 @@ def serve(
     ] = None,
     state: Annotated[
         Path | None,
-        typer.Option(envvar="SECTORLIGHT_STATE", metavar="FILE", help="Where players and lights that ask to be kept are kept."),
+        typer.Option(envvar="SECTORLIGHT_STATE", metavar="FILE", help="Where players, lights and boxes that ask to be kept are kept."),
     ] = None,
     epw: Annotated[
         Path | None, typer.Option(envvar="SECTORLIGHT_EPW", metavar="FILE", help="A measured year's weather, for PUT /v1/weather.")
