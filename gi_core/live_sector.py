@@ -33,6 +33,9 @@ FIRST_PASSES = 4
 # A second at 30 Hz, so that nothing pops when a sector arrives late, or when its sun's visibility has another source: in half of that, a
 # voxel that ends ten times as bright moves by a third in its first ticks.
 FADE_TICKS = 30
+# What is shown of a sector lags behind its light by less than this share of its brightest probe: volumes need not be filled anew for what
+# nobody would see, which a slow sun moves in a second or more.
+UNSHOWN_CHANGE = 1e-3
 # A sun this far from where it stood has jumped, and all light with it: what follows it follows at once.
 SUN_JUMPED_DEGREES = 2 * FRESH_DEGREES
 
@@ -92,6 +95,8 @@ class LiveSector:
         self._device = device
         self._tracing = tracing
         self._low, self._high = _bounds(sector)
+        self._unshown = 0.0
+        """How far its light has moved, at most, since something of it was shown, as a share of its brightest probe."""
         self._faded = 0
         self._blended_faded = 0
         """``_faded`` when what is shown was last blended."""
@@ -182,9 +187,9 @@ class LiveSector:
         peak = float(after.max(initial=0.0))
         moved = float(np.abs(after - self._cubes).max(initial=0.0))
         self._cubes, self.is_lit = after, True
-        if self._lamps_late:
-            return 1.0
-        return moved / peak if peak > 0 else float(moved > 0)
+        share = moved / peak if peak > 0 else float(moved > 0)
+        self._unshown += share
+        return 1.0 if self._lamps_late else share
 
     def settle(self, relighter: Relighter, light: LiveLight) -> bool:
         """Converge from darkness, as a query does: what is held then depends on the light alone, and on nothing that was before.
@@ -198,8 +203,9 @@ class LiveSector:
         self.is_lit = True
         return True
 
-    def advance(self, tick: int, changed: bool, is_read: bool) -> None:
-        """Say whether what is shown changes at a tick: by a relight or other gains (``changed``), or because it fades.
+    def advance(self, tick: int, must_show: bool, is_read: bool) -> None:
+        """Say whether what is shown changes at a tick: because its light has moved far enough, or is final, or gains are others
+        (``must_show``), or because it fades.
 
         A sector fades where something else was shown before: while no published volume reads it (``is_read``), it changes unseen.
         """
@@ -208,9 +214,9 @@ class LiveSector:
                 self._faded += 1
             else:
                 self._faded, self._shown = FADE_TICKS, None
-            changed = True
-        if changed:
-            self.shown_at = tick
+            must_show = True
+        if must_show or self._unshown >= UNSHOWN_CHANGE:
+            self.shown_at, self._unshown = tick, 0.0
 
     def shown(self, settings: Settings, placeholder: Callable[[], Float32], basis: str) -> cl.Buffer:
         """The light to show, on the device, in a basis: the sector's own under the artists' gains, or while it fades a blend with what

@@ -111,6 +111,8 @@ class LiveWorld:
         self._needs = LightNeeds(len(self.streamer.table.sectors))
         self._row = {index: row for row, index in enumerate(self.streamer.table.sectors)}
         self._light: LiveLight | None = None
+        self._fading: set[SectorIndex] = set()
+        """Sectors that are not yet shown as they are."""
         self._distant_sky = dataset.distant()
         self._shadows = LiveShadows(self._device, dataset) if shadow_map else None
 
@@ -157,12 +159,7 @@ class LiveWorld:
                 self._needs.disturb(self._row[index], WHOLLY if other else BURST_CHANGE)
         lap("shadow_map")
         report.missing = self.volumes.missing
-        lit = set(report.relit) | set(report.settled)
-        changed = list(report.evicted)
-        for index, sector in self.streamer.residents.items():
-            sector.advance(tick, gains_changed or index in lit, index in self.volumes.looked_at)
-            if sector.shown_at == tick:
-                changed.append(index)
+        changed = self._advance(tick, gains_changed, report)
         self.volumes.note(tick, players.ids, players.positions, changed)
         until_s = started + fill_ms / 1e3
         report.filled, report.waiting = self.volumes.fill(tick, until_s, lambda sector: self._shown(sector, light), self._placeholder)
@@ -251,6 +248,19 @@ class LiveWorld:
         for index in (*report.relit, *report.settled):
             if residents[index].lamps.nbytes:  # dozens of lamps cast more shadows than there was room for
                 self.streamer.count_again(index, lamps=False)
+
+    def _advance(self, tick: int, gains_changed: bool, report: TickReport) -> list[SectorIndex]:
+        """Sectors that show something else from this tick on, or are gone."""
+        residents, changed = self.streamer.residents, list(report.evicted)
+        # Others have shown what they show since they were looked at last.
+        self._fading.update(report.loaded, report.relit, report.settled)
+        for index in list(residents) if gains_changed else self._fading.intersection(residents):
+            sector = residents[index]
+            sector.advance(tick, gains_changed or index in report.settled, index in self.volumes.looked_at)
+            if sector.shown_at == tick:
+                changed.append(index)
+        self._fading = {index for index in self._fading.intersection(residents) if residents[index].is_fading}
+        return changed
 
     def _shown(self, sector: LiveSector, light: LiveLight) -> cl.Buffer:
         return sector.shown(light.settings, lambda: self._placeholder(sector.resident.sector.index), self.basis)

@@ -4,7 +4,7 @@ import logging
 import queue
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,6 +26,10 @@ _BYTES_PER = {"probes": 256, "factors": 16, "bricks": 80, "surfels": 128, "voxel
 _HOST_BYTES_PER = {"probes": 24, "bricks": 20, "surfels": 36, "voxels": 3}
 _HOST_BYTES_PER_COEFFICIENT, _HOST_BYTES_PER_FEEDBACK = 16, 6
 _BYTES_PER_SECTOR = 1 << 15
+
+# A plan holds while no player has gone this far [m] or changed speed by this much [m/s], a small part of what its margins allow for, but
+# not longer than this [s]: then sectors that failed may be tried again.
+PLAN_HOLDS_M, PLAN_HOLDS_M_S, PLAN_HOLDS_S = 1.0, 0.5, 0.25
 
 
 # What a probe and a brick have for each coefficient beyond the cube's six or, of a brick, for any of harmonics; and a probe's served cube.
@@ -81,6 +85,9 @@ class Streamer:
         self._row = {index: row for row, index in enumerate(table.sectors)}
         self._state = StreamState.empty(table)
         self._loading: set[SectorIndex] = set()
+        self._plan: StreamPlan | None = None
+        self._planned: tuple[Float64, Float64, float] = np.zeros((0, 3)), np.zeros((0, 3)), 0.0
+        """The plan that may hold, and the positions, velocities and time [s] that it was made for."""
         self._rows: Int64 = np.zeros(0, np.int64)
         self._done: queue.SimpleQueue[tuple[SectorIndex, LiveSector | Exception]] = queue.SimpleQueue()
         # One thread: decoding holds Python's lock half of the time, and more would take it from the ticks.
@@ -104,7 +111,7 @@ class Streamer:
                 index, found = self._done.get_nowait()
             except queue.Empty:
                 return arrived
-            row = self._row[index]
+            row, self._plan = self._row[index], None
             self._loading.discard(index)
             self._state.loading[row] = False
             if isinstance(found, LiveSector):
@@ -123,7 +130,14 @@ class Streamer:
                 log.error("%s", found)
 
     def step(self, positions: Float64, velocities: Float64) -> StreamPlan:
-        """Plan for players at positions (p, 3) [m] with velocities (p, 3) [m/s], evict and start to load."""
+        """Plan for players at positions (p, 3) [m] with velocities (p, 3) [m/s], evict and start to load.
+
+        The last plan holds, with nothing left to do, while nobody has gone far or turned and nothing has arrived or may be tried again.
+        """
+        plan = self._plan
+        if plan is not None and self._holds(positions, velocities):
+            self.misses += len(plan.missing)
+            return plan
         plan = plan_streaming(self.table, self._state, positions, velocities, now_s=time.monotonic(), options=self._options)
         for index in plan.evictions:
             del self.residents[index]
@@ -134,11 +148,21 @@ class Streamer:
             self._state.loading[self._row[index]] = True
             self._loader.submit(self._bring, index)
         self.misses += len(plan.missing)
+        self._plan, self._planned = replace(plan, loads=(), evictions=()), (positions, velocities, time.monotonic())
         return plan
+
+    def _holds(self, positions: Float64, velocities: Float64) -> bool:
+        before, going, at_s = self._planned
+        return (
+            time.monotonic() - at_s < PLAN_HOLDS_S
+            and before.shape == positions.shape
+            and bool((np.abs(positions - before) <= PLAN_HOLDS_M).all())
+            and bool((np.abs(velocities - going) <= PLAN_HOLDS_M_S).all())
+        )
 
     def count_again(self, index: SectorIndex, lamps: bool) -> None:
         """Count what a resident sector takes now, with room for ``lamps`` or not, where that is more: the next step makes it fit."""
-        row = self._row[index]
+        row, self._plan = self._row[index], None
         self._state.resident_bytes[row] = max(int(self._state.resident_bytes[row]), self.residents[index].budget_bytes(lamps))
 
     def resident_rows(self) -> Int64:

@@ -4,7 +4,7 @@ import shutil
 import threading
 import time
 from dataclasses import replace
-from datetime import datetime
+from datetime import datetime, timedelta
 from itertools import count, pairwise
 from pathlib import Path
 from threading import Lock
@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from gi_core import stream
 from gi_core.constants import VOXEL_INDOORS, VOXEL_OUTDOORS, VOXEL_SIZE_M
 from gi_core.dataset import Dataset, sector_path
 from gi_core.device import Device, shared_device
@@ -23,7 +24,7 @@ from gi_core.light_blend import LightVector
 from gi_core.light_geometry import ShadowGeometry
 from gi_core.lighting import Lighting
 from gi_core.lights import lamps_on
-from gi_core.live_sector import FADE_TICKS, LiveLight, LiveSector
+from gi_core.live_sector import FADE_TICKS, UNSHOWN_CHANGE, LiveLight, LiveSector
 from gi_core.live_volume import PublishedVolume
 from gi_core.live_volumes import HELD_TICKS
 from gi_core.live_world import LiveWorld, TickPlayers, TickReport
@@ -322,9 +323,9 @@ def test_a_sector_of_any_size_is_lit_shown_and_dark_again(make_sector, engine, s
             live.light(light)
             relighter.relight([live.resident], light.given, 3)
             assert 0 <= live.measure() < np.inf
-            live.advance(next(number), changed=True, is_read=True)
+            live.advance(next(number), must_show=True, is_read=True)
         assert live.settle(relighter, light)
-        live.advance(next(number), changed=True, is_read=True)
+        live.advance(next(number), must_show=True, is_read=True)
         device.read(live.shown(panel, lambda: np.zeros((6, 3), np.float32), "cube"), shown)
         assert np.isfinite(shown).all()
         assert shown.any() == (lighting is noon and sector.probe_count > 0)
@@ -725,3 +726,37 @@ def test_a_running_clock_is_followed(world, engine):
         changes.append(np.abs(world.volumes.of_player["p0"].published.values - expected).max() / expected.max())
     # A minute a tick is 1800 x: a relight behind, two of which make up a volume's two sectors.
     assert np.median(changes) < 0.02
+
+
+def test_light_that_hardly_moves_is_followed_without_filling_volumes_at_every_relight(world, engine):
+    run = Run(world)
+    start = datetime(2024, 6, 21, 9)
+    run.settle(at(STREET), light_of(world, engine.lighting(start.isoformat(), "clear")))
+    relit, filled, behind = 0, 0, []
+    for tick in range(1, 121):
+        lighting = engine.lighting((start + timedelta(seconds=tick)).isoformat(), "clear")
+        report = run.tick(at(STREET), light_of(world, lighting, standing=False))
+        relit, filled = relit + len(report.relit), filled + len(report.filled)
+        if tick % 20 == 0:
+            expected = engine.volume(STREET, lighting).values
+            behind.append(np.abs(world.published("p0").values - expected).max() / expected.max())
+    # A second of the sun a tick, 30 times its pace at 30 Hz: what is shown is at most a thousandth of a sector's brightest probe old,
+    # and as much again lies between its light and a query's, by a relight that is a tick late.
+    assert relit > 100
+    assert 0 < filled < relit / 2
+    assert max(behind) < 2 * UNSHOWN_CHANGE
+
+
+def test_a_plan_holds_until_somebody_has_gone_a_metre_or_a_sector_arrives(world, engine, monkeypatch):
+    run, light, plans = Run(world), light_of(world, engine.lighting("12:00", "clear")), []
+    run.settle(at(STREET), light)
+    made = stream.plan_streaming
+    monkeypatch.setattr(stream, "plan_streaming", lambda *given, **more: plans.append(given[2]) or made(*given, **more))
+    monkeypatch.setattr(stream, "PLAN_HOLDS_S", LATE_S)
+    for step in range(50):
+        run.tick(at(STREET + 0.1 * step * EAST), light)
+    assert 4 <= len(plans) <= 5
+    assert all(np.abs(later - earlier).max() > stream.PLAN_HOLDS_M for earlier, later in pairwise(plans))
+    run.tick(at(STREET + 4.9 * EAST, velocity=(3.0, 0.0, 0.0)), light)
+    assert len(plans) <= 6
+    assert plans[-1][0, 0] == pytest.approx(STREET[0] + 4.9)

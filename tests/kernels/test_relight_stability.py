@@ -108,7 +108,7 @@ def test_with_all_gains_and_colours_at_their_maximum_ticks_never_grow(make_secto
         live.light(light)
         relighter.relight([live.resident], light.given)
         live.measure()
-        live.advance(tick, changed=True, is_read=True)
+        live.advance(tick, must_show=True, is_read=True)
         device.read(live.shown(panel, lambda: np.full((6, 3), MAX_AMBIENT_LX, np.float32), "cube"), shown)
         if tick == 1_000:  # 0.95 ** 1000 is 5e-23: all that bounces will ever add is there
             kept[:] = shown
