@@ -35,7 +35,7 @@ FIRST_PASSES = 4
 FADE_TICKS = 30
 # What is shown of a sector lags behind its light by less than this share of its brightest probe: volumes need not be filled anew for what
 # nobody would see, which a slow sun moves in a second or more.
-UNSHOWN_CHANGE = 1e-3
+UNSHOWN_CHANGE = 2e-4
 # A sun this far from where it stood has jumped, and all light with it: what follows it follows at once.
 SUN_JUMPED_DEGREES = 2 * FRESH_DEGREES
 
