@@ -1,4 +1,4 @@
-"""Timings, each beside its baseline in the same run: here volume and decode, in ``bench_relight`` the relighter. Any device.
+"""Timings, each beside its baseline in one run: here decode, in ``bench_relight`` the relighter, in ``bench_volume`` volumes. Any device.
 
 Made-up sectors of the talk's size.
 
@@ -13,14 +13,13 @@ from typing import Any
 import numpy as np
 
 from gi_core import factor_weights, sector_file
-from gi_core.constants import BRICK_CELL_M, VOLUME_SHAPE
+from gi_core.constants import BRICK_CELL_M
 from gi_core.device import Device, shared_device
 from gi_core.grid import SectorIndex
 from gi_core.layout import DIRECTIONAL_LIGHT
 from gi_core.relight_input import RelightInput
 from gi_core.resident_sector import ResidentSector
 from gi_core.sector import Sector, starts
-from gi_core.volume import box_record, plan_boxes
 
 TALK_PROBES, TALK_SURFELS, TALK_FACTORS = 294, 14_355, 29_400
 SURFELS_PER_BRICK = 7
@@ -135,32 +134,6 @@ def daylight() -> RelightInput:
     return RelightInput(np.full((SKY_PATCHES, 3), (1.2e4, 1.4e4, 1.8e4), np.float32), sun)
 
 
-def bench_volume(device: Device, rounds: int = 100) -> Measurement:
-    """Filling the volume from four lit sectors, on the device. Baseline: copying as many bytes in memory."""
-    resident = ResidentSector(device, talk_size_sector(0), SKY_PATCHES)
-    resident.write_cubes(np.random.default_rng(0).uniform(0, 1e4, (TALK_PROBES, 6, 3)).astype(np.float32))
-    values = np.zeros((6, *VOLUME_SHAPE, 3), np.float32)
-    target = device.allocate(values.nbytes)
-    # The one made-up sector stands in for each of the four around the corner that they share.
-    boxes = plan_boxes(np.array([4, 0, 4]))
-    records = []
-    for box in boxes:
-        record = box_record(box, resident.sector)
-        record["sector_first"][0, [0, 2]] = 0
-        records.append((record, (min(int(box.size[0]), 20), int(box.size[1]), min(int(box.size[2]), 20))))
-
-    def fill() -> None:
-        for record, size in records:
-            resident.fill_volume(record, size, target)
-        device.queue.finish()
-
-    copy = values.copy()
-    milliseconds, baseline = (1e3 * s for s in side_by_side(fill, lambda: np.copyto(copy, values), rounds))
-    return Measurement(
-        "volume_fill", milliseconds, "ms", baseline, baseline / milliseconds, {"bytes": values.nbytes}, device.name, "memcpy"
-    )
-
-
 def bench_decode(device: Device, rounds: int = 30) -> Measurement:
     """From a sector's file in memory to its buffers on the device. Baseline: decompressing the same bytes and no more."""
     import zstandard
@@ -181,11 +154,11 @@ def bench_decode(device: Device, rounds: int = 30) -> Measurement:
 
 def run(device_name: str | None = None, quick: bool = False) -> list[Measurement]:
     """All measurements of this module on one device; ``quick`` ones are a look, not a result. Raises DeviceError."""
-    from gi_core import bench_basis, bench_relight, bench_roofline  # these import this module
+    from gi_core import bench_basis, bench_relight, bench_roofline, bench_volume  # these import this module
     from gi_core.bench_lamps import bench_lamps
 
     device = shared_device(device_name)
     relight = bench_relight.run(device, quick)
-    volume, decode = bench_volume(device, 10 if quick else 100), bench_decode(device, 3 if quick else 30)
-    rows = [*relight, volume, decode, *bench_lamps(device, quick)]
+    volumes = [bench(device, 10 if quick else 100) for bench in (bench_volume.bench_fill, bench_volume.bench_step)]
+    rows = [*relight, *volumes, bench_decode(device, 3 if quick else 30), *bench_lamps(device, quick)]
     return rows if quick else [*rows, *bench_basis.run(device), *bench_roofline.run(device.name)]

@@ -17,6 +17,7 @@ from urllib.parse import urlencode, urlsplit
 
 import numpy as np
 
+from gi_core.arrays import Float64
 from gi_core.bench import Measurement
 from gi_core.dataset import Dataset
 from gi_core.errors import SectorlightError
@@ -117,14 +118,18 @@ def bench_http(dataset_path: Path, device: str | None = None, rounds: int = 60, 
     )
 
 
-def volume_target(dataset: Dataset) -> str:
-    """Path and query of a raw volume in the middle of a dataset's first sector with probes, above its ground."""
+def volume_place(dataset: Dataset) -> Float64:
+    """(3,) [m]: in the middle of a dataset's first sector with probes, above its ground."""
     sectors = dataset.world.sectors
     index = next((i for i in sorted(sectors) if sectors[i].probes), None)
     if index is None:
         raise BenchError(f"{dataset.path}: no sector has a probe, so there is no light to serve")
-    x, _, z = (float(v) for v in index.origin + 32.0)
-    place = {"x": x, "y": float(dataset.world.bounds[0, 1]) + 10.0, "z": z}
+    return np.array([index.origin[0] + 32.0, dataset.world.bounds[0, 1] + 10.0, index.origin[2] + 32.0])
+
+
+def volume_target(dataset: Dataset) -> str:
+    """Path and query of a raw volume at ``volume_place``."""
+    place = dict(zip("xyz", volume_place(dataset).tolist(), strict=True))
     return f"/v1/volume?{urlencode({'time': '12:00', 'weather': 'clear', **place, 'format': 'raw', 'encoding': 'f16'})}"
 
 

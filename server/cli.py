@@ -241,7 +241,7 @@ def bench(
     device: DeviceOption = None,
     quick: Annotated[bool, typer.Option("--quick", help="A few repeats of each: shows that all works, not how fast.")] = False,
 ) -> None:
-    """Time relighting, volume, decoding, baking and HTTP, each beside its baseline in the same run."""
+    """Time relighting, volumes and their formats, decoding, baking and HTTP, each beside its baseline in the same run."""
     from tempfile import TemporaryDirectory
 
     from rich.console import Console
@@ -249,6 +249,7 @@ def bench(
     import bake_jobs.bench
     import gi_core.bench
     import server.bench
+    import server.bench_pack
     from bake_jobs.runner import bake as run_bake
     from server import cli_bench
 
@@ -259,9 +260,10 @@ def bench(
             measured = gi_core.bench.run(device, quick)
             status.update("bake")
             measured.append(bake_jobs.bench.bench_bake(1 if quick else 5))
-            status.update("http")
+            status.update("pack, http")
             with TemporaryDirectory(prefix="sectorlight-bench-") as folder:
                 run_bake(BENCH_SOURCE, Path(folder) / "city", "draft", 1, console=Console(quiet=True))
+                measured += server.bench_pack.bench_pack(Path(folder) / "city", device, 3 if quick else 100)
                 measured.append(server.bench.bench_http(Path(folder) / "city", device, *((2, 20) if quick else ())))
         cli_bench.show(measured)
         if json_path is not None:

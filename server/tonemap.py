@@ -31,10 +31,10 @@ def metered(radiance: Float32, ev100: float) -> float:
 
 
 def exposed(radiance: Float32, ev100: float) -> Float32:
-    """Radiance [cd m^-2] relative to white, one stop brighter than the meter's; as far as FLAT_BEYOND."""
+    """Radiance [cd m^-2] relative to white, one stop brighter than the meter's; as far as FLAT_BEYOND either way."""
     gain = BRIGHTENING / (WHITE_PER_EV * 2.0**ev100)
     most = min(FLAT_BEYOND / gain, float(np.finfo(np.float32).max))  # float32 has no room for all of it under a black sky
-    return np.asarray(np.minimum(radiance, np.float32(most)) * np.float32(gain), np.float32)
+    return np.asarray(np.clip(radiance, np.float32(-most), np.float32(most)) * np.float32(gain), np.float32)
 
 
 def filmic(linear: Float32) -> Float32:

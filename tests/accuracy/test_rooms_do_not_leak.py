@@ -118,6 +118,18 @@ def test_day_does_not_darken_the_outside_of_a_dark_house(engine):
     assert beside.min() > 0.2 * np.median(beside)
 
 
+def test_a_room_of_planes_without_thickness_is_dark_at_noon_and_its_outside_bright(build, tmp_path):
+    scene = build().ground((-64, -64), (128, 128), albedo=0.4).box(DARK.minimum, DARK.maximum, albedo=0.6, inward=True)
+    make_golden().write_golden(tmp_path, replace(settings_for("talk"), **QUICK), scene.scene(rooms=(DARK,)))
+    sheets = Engine(Dataset.open(tmp_path))
+    noon = sheets.lighting("12:00", "clear")
+    dark = seen(sheets.interior(np.array([28.0, 4.0, 32.0]), noon, room="dark"), "dark")
+    for cascade in (-1, 0, 1):
+        outside = seen(sheets.volume(np.array([15.0, 2.0, 32.0]), noon, cascade=cascade), "west")
+        assert outside.min() > 1000
+        assert dark.max() <= LEAK * np.median(outside)
+
+
 def test_a_room_without_a_probe_does_not_show_the_light_that_it_borrowed(engine, tmp_path):
     city = tmp_path / "city"
     shutil.copytree(engine.dataset.path, city)

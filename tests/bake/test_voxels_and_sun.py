@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from bake_jobs.config import ADAPTIVE
 from bake_jobs.rays import SURFACE_OFFSET_M, RayScene
 from gi_core.constants import ROOM_OUTDOORS, VOXEL_INDOORS, VOXEL_OUTDOORS, VOXEL_SIZE_M, VOXEL_SOLID
 from gi_core.grid import SectorIndex, voxel_columns
@@ -91,6 +92,18 @@ def test_free_voxels_blend_what_they_see_and_only_their_own_room(hall):
             assert distance[0] == pytest.approx(closest, abs=1e-4)
     assert blind <= meta["voxels_blind"]  # which counts the margin's too
     assert (sector.voxel_room == 1).any()
+
+
+@pytest.mark.parametrize("settings", [{}, {**ADAPTIVE, "trial_rays_per_face_edge": 4}], ids=["grid", "adaptive"])
+def test_no_voxel_blends_a_probe_behind_a_plane_without_thickness(build, bake_arrays, settings):
+    wall_x = 30.0
+    scene = build().ground().quad((wall_x, 0, -40), (0, 12, 0), (0, 0, 144)).scene()
+    sector, _ = bake_arrays(scene, **QUICK, **settings)
+    at = centres(sector)[..., None, :]
+    probe = sector.probe_position[sector.voxel_probe]
+    used = (sector.voxel_weight > 0) & (at[..., 1] > 0) & (at[..., 1] < 9) & (probe[..., 1] < 12)
+    assert (used & (np.abs(at[..., 0] - wall_x) < 4)).sum() > 100
+    assert ((at[..., 0] < wall_x) == (probe[..., 0] < wall_x))[used].all()
 
 
 def test_solid_voxels_blend_what_some_nearest_air_blends(hall):

@@ -16,8 +16,9 @@ from gi_core.bench import side_by_side
 from server.bench import BenchError, Connection
 
 RELIGHT = [f"relight_two_sectors{which}" for which in ("", "_resampled", "_settled", "_flicker")]
-NAMES = [*RELIGHT, "relight_host", "volume_fill", "sector_decode", "lamp_moved", "bake_sector", "http_volume"]
-UNITS = [*["ms"] * 8, "s", "requests/s"]
+PACK = [f"volume_pack_{which}" for which in ("npy", "f16", "rgb9e5", "ktx2_f16", "ktx2_rgb9e5", "stream")]
+NAMES = [*RELIGHT, "relight_host", "volume_fill", "volume_step", "sector_decode", "lamp_moved", "bake_sector", *PACK, "http_volume"]
+UNITS = [*["ms"] * 9, "s", *["us"] * 6, "requests/s"]
 
 
 def test_a_quick_run_has_every_row_beside_its_baseline(tmp_path: Path) -> None:
@@ -39,6 +40,14 @@ def test_a_quick_run_has_every_row_beside_its_baseline(tmp_path: Path) -> None:
     # One sector of a city: a bake casts its primary rays, and more.
     bake = rows[NAMES.index("bake_sector")]
     assert bake["baseline"] < bake["median"]
+    # Texels of six faces: twelve, eight and four bytes a colour, files a little more for their heads, a stream's halves compressed.
+    colours = 6 * 16 * 32 * 32
+    exact, half, shared, half_file, shared_file, frame = (rows[NAMES.index(name)]["sizes"]["bytes"] for name in PACK)
+    assert (half, shared) == (8 * colours, 4 * colours)
+    assert 12 * colours < exact < 12 * colours + 1000
+    assert half < half_file < half + 2000
+    assert shared < shared_file < shared + 2000
+    assert 1000 < frame < 6 * colours
 
 
 @pytest.mark.parametrize("options", [("--json", "nowhere/out.json"), ("--device", "abacus")])
