@@ -4,7 +4,8 @@
                                            1/2 at its edge, 0 far off
 
 t is the level distance from the edge, positive outside, over a height above the ground: the top's outside, the underside's within. A box
-hides the product over its two axes of g(near edge) - g(far edge): exact for an endless strip. MATH.md, "Decals".
+hides the product over its two axes of g(near edge) - g(far edge). That is exact for an endless strip; beside a box the height within is
+seen aslant, so that the other axis's distance counts as much as it. MATH.md, "Decals".
 """
 
 import math
@@ -23,7 +24,7 @@ REACH = 4.0
 _REST = (1 - REACH / math.hypot(1, REACH)) / 2
 # Ground farther below a box's underside is not the ground that it stands on, but the street under its bridge.
 BELOW_M = 1.5
-# A box that stands on the ground leaves no gap; one of this much tells inside from outside.
+# A box that stands on the ground leaves no gap; one of this much tells inside from outside, and stored geometry is that exact.
 _LEAST_GAP_M = 0.01
 GRADIENT_TEXELS = 256
 
@@ -68,18 +69,20 @@ def gradient_texels() -> UInt8:
 def hidden_share(decal: Decal, position: Float64, normal: Float32) -> Float32:
     """How much of the indirect light of surface points (n, 3) [m] with normals (n, 3) a decal's box hides: (n,) 0..1.
 
-    Derived for level ground; of a surface that leans it takes n.y as much, and nothing from what faces down. None from its top on, and
-    more than BELOW_M under it.
+    Derived for level ground; of a surface that leans it takes n.y as much, and nothing from what faces down. None from its top on, none
+    more than BELOW_M under it, and none within it: that is the vehicle itself.
     """
     local = (position - np.array(decal.position)) @ world_from_box(decal)[:3, :3]
     width, height, length = decal.size
-    under = np.maximum(-local[:, 1], _LEAST_GAP_M)
-    above = np.maximum(height - local[:, 1], _LEAST_GAP_M)
-    hidden = np.maximum(normal[:, 1], 0) * ((local[:, 1] < height) & (local[:, 1] >= -BELOW_M))
-    for across, side in ((local[:, 0], width), (local[:, 2], length)):
-        near, far = np.abs(across) - side / 2, np.abs(across) + side / 2
-        hidden = hidden * (gradient(near / np.where(near > 0, above, under)) - gradient(far / under))
-    return np.asarray(hidden, np.float32)
+    half = np.array([width, length]) / 2
+    near, far = np.abs(local[:, [0, 2]]) - half, np.abs(local[:, [0, 2]]) + half
+    rise = local[:, 1]
+    above = np.maximum(height - rise, _LEAST_GAP_M)[:, None]
+    under = np.hypot(np.maximum(-rise, _LEAST_GAP_M)[:, None], np.maximum(near, 0)[:, ::-1])
+    # Far off a corner both would be below 0, and their product above it.
+    share = np.maximum(gradient(near / np.where(near > 0, above, under)) - gradient(far / under), 0)
+    on_it = (rise < height) & (rise >= -BELOW_M) & ((rise <= _LEAST_GAP_M) | (near > _LEAST_GAP_M).any(axis=1))
+    return np.asarray(on_it * np.maximum(normal[:, 1], 0) * share.prod(axis=1), np.float32)
 
 
 def reach_m(decal: Decal) -> float:
