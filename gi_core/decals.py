@@ -75,20 +75,24 @@ def hidden_share(decal: Decal, position: Float64, normal: Float32) -> Float32:
     local = (position - np.array(decal.position)) @ world_from_box(decal)[:3, :3]
     width, height, length = decal.size
     half = np.array([width, length]) / 2
-    near, far = np.abs(local[:, [0, 2]]) - half, np.abs(local[:, [0, 2]]) + half
-    rise = local[:, 1]
+    near, rise = np.abs(local[:, [0, 2]]) - half, local[:, 1]
+    on_it = (normal[:, 1] > 0) & (rise < height) & (rise >= -BELOW_M) & (near < REACH * (height - rise)[:, None]).all(axis=1)
+    some = np.flatnonzero(on_it & ((rise <= _LEAST_GAP_M) | (near > _LEAST_GAP_M).any(axis=1)))
+    hidden = np.zeros(len(position), np.float32)
+    near, rise = near[some], rise[some]
+    far = near + 2 * half
     above = np.maximum(height - rise, _LEAST_GAP_M)[:, None]
     under = np.hypot(np.maximum(-rise, _LEAST_GAP_M)[:, None], np.maximum(near, 0)[:, ::-1])
     # Far off a corner both would be below 0, and their product above it.
     share = np.maximum(gradient(near / np.where(near > 0, above, under)) - gradient(far / under), 0)
-    on_it = (rise < height) & (rise >= -BELOW_M) & ((rise <= _LEAST_GAP_M) | (near > _LEAST_GAP_M).any(axis=1))
-    return np.asarray(on_it * np.maximum(normal[:, 1], 0) * share.prod(axis=1), np.float32)
+    hidden[some] = normal[some, 1] * share[:, 0] * share[:, 1]
+    return hidden
 
 
-def reach_m(decal: Decal) -> float:
-    """How far from its position [m] a decal hides anything."""
+def reach_m(decal: Decal, lowest: float = -math.inf) -> float:
+    """How far from its position [m] a decal hides anything of what lies at ``lowest`` [m] or above."""
     width, height, length = decal.size
-    tallest = height + BELOW_M
+    tallest = height + min(max(decal.position[1] - lowest, 0.0), BELOW_M)
     return math.hypot(width / 2 + REACH * tallest, length / 2 + REACH * tallest, tallest)
 
 

@@ -38,7 +38,7 @@ def kept_by_decals(decals: Sequence[Decal], position: Float64, normal: Float32) 
     if not len(position) or not decals:
         return kept
     cells, (low, high) = PixelCells.of(position), (position.min(axis=0), position.max(axis=0))
-    centres, reach = np.array([decal.position for decal in decals]), np.array([reach_m(decal) for decal in decals])
+    centres, reach = np.array([decal.position for decal in decals]), np.array([reach_m(decal, low[1]) for decal in decals])
     # A city has thousands; a street's picture needs dozens.
     for number in np.flatnonzero(np.linalg.norm(centres - np.clip(centres, low, high), axis=1) < reach).tolist():
         near = cells.order[cells.within(centres[number], float(reach[number]))]
