@@ -23,7 +23,7 @@ from gi_core.lights import (
 from gi_core.world import LAMP_KINDS, Lamp
 
 # Top-level keys of a world.toml that say nothing about its lamps.
-_OTHER_KEYS = ("name", "north_degrees", "location", "source", "room", "hint")
+_OTHER_KEYS = ("name", "north_degrees", "location", "source", "room", "decal", "hint")
 
 
 def read_lamp(table: Table) -> Lamp:

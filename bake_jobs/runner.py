@@ -179,6 +179,7 @@ def bake(
         lamps=scene.lamps,
         dropped_triangles=asdict(scene.dropped),
         error_report=report,
+        decals=scene.decals,
     )
     with _writing(output):
         write_atomic(output / DISTANT_FILE, distant_file.encode(texels, bake_id))

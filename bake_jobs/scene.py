@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gi_core.arrays import Float32, Float64, Int32, Int64
-from gi_core.world import Lamp, Location, Room
+from gi_core.world import Decal, Lamp, Location, Room
 
 
 @dataclass(frozen=True)
@@ -64,6 +64,7 @@ class SourceContent:
     lamps: tuple[Lamp, ...] = ()
     hints: tuple[ProbeHint, ...] = ()
     name: str = ""
+    decals: tuple[Decal, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +87,7 @@ class Scene:
     lamps: tuple[Lamp, ...] = ()
     hints: tuple[ProbeHint, ...] = ()
     dropped: DroppedTriangles = field(default_factory=DroppedTriangles)
+    decals: tuple[Decal, ...] = ()
 
     @property
     def bounds(self) -> Float64:
@@ -114,7 +116,7 @@ def join_meshes(meshes: Sequence[Mesh]) -> Mesh:
 
 
 def scene_digest(scene: Scene) -> str:
-    """32 hexadecimal digits that identify everything in a scene which a bake reads; its name and the dropped counts are left out."""
+    """32 hexadecimal digits that identify all of a scene that its sectors depend on: not its name, decals and dropped counts."""
     h = hashlib.blake2b(digest_size=16)
     for values, dtype in (
         (scene.vertices, np.dtype("<f8")),

@@ -47,6 +47,7 @@ def load_scene(source: str | Path) -> Scene:
         content.lamps,
         content.hints,
         dropped,
+        content.decals,
     )
 
 

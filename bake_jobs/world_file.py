@@ -1,4 +1,4 @@
-"""world.toml: several sources in one world, with its place, rooms, lamps and probe hints. Every key is checked; unknown ones are refused.
+"""world.toml: several sources in one world, with place, rooms, lamps, decals and hints. Every key is checked; unknown ones are refused.
 
 name = "my city"                       # all keys are optional but [[source]] and its path
 north_degrees = 29.0                   # compass azimuth of the world's -Z axis; streets run along the axes when it is theirs
@@ -32,6 +32,12 @@ cone_degrees = 90.0                    # of a spot, full angle
 size = [1.0, 1.0]                      # of an area, width and height; the width is level
 schedule = "always"                    # or "night", or local times: "18:00-23:30"
 
+[[decal]]                              # a box that darkens the ground: a parked vehicle that no source has
+name = "taxi"
+position = [3.0, 0.25, 8.0]            # the middle of its underside
+size = [1.8, 1.25, 4.6]                # width, height and length, along its own x, y and z
+yaw_degrees = 30.0                     # counter-clockwise seen from above
+
 [[hint]]
 kind = "add"                           # add, forbid, or densify: more where light changes (adaptive placement)
 minimum = [0.0, 0.0, 0.0]
@@ -51,8 +57,10 @@ from bake_jobs.geography import MapFrame, timezone_at
 from bake_jobs.lamp_file import read_lamp
 from bake_jobs.scene import Mesh, ProbeHint, SourceContent, join_meshes
 from bake_jobs.table import Table, read_toml
+from gi_core.dataset import MAX_DECALS
+from gi_core.decals import MAX_SIZE_M, MAX_YAW_DEGREES, MIN_SIZE_M
 from gi_core.errors import SourceError
-from gi_core.world import Location, Room
+from gi_core.world import Decal, Location, Room
 
 HINT_KINDS = ("add", "forbid", "densify")
 MAX_ROOMS = 65_535  # a sector stores room numbers as uint16, and 0 is outdoors
@@ -71,17 +79,20 @@ def load_world_file(path: Path, load: Loader) -> SourceContent:
     rooms = tuple(_room(table) for table in top.tables("room"))
     lamps = tuple(read_lamp(table) for table in top.tables("lamp"))
     hints = tuple(_hint(table) for table in top.tables("hint"))
+    decals = tuple(_decal(table) for table in top.tables("decal"))
     top.refuse_unknown()
     if not sources:
         raise SourceError(f"{path}: expected at least one [[source]] with a path, found none")
     if len(rooms) > MAX_ROOMS:
         raise SourceError(f"{path}: expected at most {MAX_ROOMS} rooms, found {len(rooms)}")
+    if len(decals) > MAX_DECALS:
+        raise SourceError(f"{path}: expected at most {MAX_DECALS} decals, found {len(decals)}")
     placed = [content for content in sources if content.location]
     if location is None:
         if len(placed) > 1:
             raise SourceError(f"{path}: expected a [location] to place {len(placed)} georeferenced sources in one world, found none")
         location = placed[0].location if placed else dataclasses.replace(Location(), north_degrees=north)
-    return SourceContent(join_meshes([content.mesh for content in sources]), location, rooms, lamps, hints, name)
+    return SourceContent(join_meshes([content.mesh for content in sources]), location, rooms, lamps, hints, name, decals)
 
 
 def _location(table: Table, north: float) -> Location:
@@ -121,6 +132,17 @@ def _room(table: Table) -> Room:
     minimum, maximum = _box(table)
     table.refuse_unknown()
     return Room(name, minimum, maximum)
+
+
+def _decal(table: Table) -> Decal:
+    decal = Decal(
+        table.text("name", None),
+        table.vector("position", None, -1e9, 1e9),
+        table.vector("size", None, MIN_SIZE_M, MAX_SIZE_M),
+        table.number("yaw_degrees", Decal.yaw_degrees, -MAX_YAW_DEGREES, MAX_YAW_DEGREES),
+    )
+    table.refuse_unknown()
+    return decal
 
 
 def _hint(table: Table) -> ProbeHint:

@@ -15,6 +15,7 @@ from gi_core import container, distant_file, fine_file, geometry_file, sector_fi
 from gi_core.arrays import Float64
 from gi_core.clock_time import time_zone
 from gi_core.constants import BASIS_SIZES, CUBE_FACES, MAX_SKY_PATCHES
+from gi_core.decals import check_decal
 from gi_core.distant_file import DistantTexels
 from gi_core.errors import CorruptFileError, FormatVersionError, InputError, SectorMissingError
 from gi_core.geometry_file import Geometry
@@ -25,12 +26,12 @@ from gi_core.sector import Sector
 from gi_core.sky_patches import MIN_PATCHES, SKY_SCHEMES
 from gi_core.sun_table import SunTable
 from gi_core.voxel_grid import VoxelGrid
-from gi_core.world import LAMP_KINDS, Lamp, Location, Room
+from gi_core.world import LAMP_KINDS, Decal, Lamp, Location, Room
 
 FORMAT = "sectorlight-dataset"
 # Version 1 knew the ambient cube under six sky scalars alone; a bake of that kind still has it, so that older programs read it.
-# Version 3 has fine voxels.
-VERSION, PATCHES_VERSION, CUBE_VERSION = 3, 2, 1
+# Version 3 has fine voxels, version 4 decals.
+VERSION, FINE_VERSION, PATCHES_VERSION, CUBE_VERSION = 4, 3, 2, 1
 WORLD_FILE = "world.json"
 DISTANT_FILE = "distant.gidist"
 MAX_WORLD_BYTES = 1 << 28
@@ -41,6 +42,8 @@ MAX_SECTOR_COORDINATE = 1_000_000
 # Room numbers have 16 bits, and 0 is outdoors.
 MAX_ROOMS = 65_535
 MAX_LAMPS = 1 << 20
+# Six times the talk's 22 300 vehicles.
+MAX_DECALS = 1 << 17
 
 
 @dataclass(frozen=True)
@@ -104,6 +107,7 @@ class WorldInfo:
     lamps: tuple[Lamp, ...]
     dropped_triangles: dict[str, int]
     error_report: dict[str, Any] | None = None
+    decals: tuple[Decal, ...] = ()
 
     @property
     def counts(self) -> dict[str, int]:
@@ -124,13 +128,17 @@ class WorldInfo:
     @property
     def version(self) -> int:
         """The lowest format version of world.json that can say this."""
-        if self.has_fine_voxels:
+        if self.decals:
             return VERSION
+        if self.has_fine_voxels:
+            return FINE_VERSION
         return CUBE_VERSION if (self.basis, self.sky) == ("cube", "faces") else PATCHES_VERSION
 
     def to_json(self) -> dict[str, Any]:
         """The object that world.json holds."""
-        described = {} if self.version == CUBE_VERSION else {"sky": self.sky}
+        described: dict[str, Any] = {} if self.version == CUBE_VERSION else {"sky": self.sky}
+        if self.version == VERSION:
+            described["decals"] = [asdict(decal) for decal in self.decals]
         return described | {
             "format": FORMAT,
             "version": self.version,
@@ -168,7 +176,8 @@ class WorldInfo:
             raise FormatVersionError(
                 f"{where}: dataset version {found}, this program reads versions {CUBE_VERSION} to {VERSION}; bake it again"
             )
-        top = Fields(record, where, _TOP_LEVEL - {"sky"} if found == CUBE_VERSION else _TOP_LEVEL)
+        absent = ({"decals"} if found < VERSION else set()) | ({"sky"} if found == CUBE_VERSION else set())
+        top = Fields(record, where, _TOP_LEVEL - absent)
         basis, sky, patches = _directions(top, found)
         low, high = _corners(top)
         report = None if record["error_report"] is None else top.mapping("error_report")
@@ -194,6 +203,7 @@ class WorldInfo:
             lamps=tuple(_lamp(Fields(r, f"{where}: lamps", Lamp.__dataclass_fields__)) for r in top.sequence("lamps", MAX_LAMPS)),
             dropped_triangles={name: top.fields("dropped_triangles").integer(name) for name in top.mapping("dropped_triangles")},
             error_report=report,
+            decals=_decals(top) if found == VERSION else (),
         )
 
 
@@ -214,7 +224,7 @@ def _sectors(top: Fields, version: int) -> dict[SectorIndex, SectorFacts]:
     records = top.mapping("sectors")
     if len(records) > MAX_SECTORS:
         raise CorruptFileError(f"{top.where}: expected at most {MAX_SECTORS} sectors, found {len(records)}; bake it again")
-    optional = _OPTIONAL_FACTS if version == VERSION else _OPTIONAL_FACTS - {"fine_bytes"}
+    optional = _OPTIONAL_FACTS if version >= FINE_VERSION else _OPTIONAL_FACTS - {"fine_bytes"}
     sectors = {}
     for key, record in records.items():
         match = _SECTOR_KEY.fullmatch(key)
@@ -289,6 +299,19 @@ def _lamp(lamp: Fields) -> Lamp:
         check_lamp(found)
     except InputError as error:
         raise CorruptFileError(f"{lamp.where}: {error}; bake it again") from error
+    return found
+
+
+def _decals(top: Fields) -> tuple[Decal, ...]:
+    return tuple(_decal(Fields(r, f"{top.where}: decals", Decal.__dataclass_fields__)) for r in top.sequence("decals", MAX_DECALS))
+
+
+def _decal(decal: Fields) -> Decal:
+    found = Decal(decal.text("name"), decal.point("position"), decal.point("size"), decal.number("yaw_degrees"))
+    try:
+        check_decal(found)
+    except InputError as error:
+        raise CorruptFileError(f"{decal.where}: {error}; bake it again") from error
     return found
 
 

@@ -1,4 +1,4 @@
-"""What a whole world has: where on Earth it lies, its rooms and lamps. Part of world.json; no geometry."""
+"""What a whole world has: where on Earth it lies, its rooms, lamps and decals. Part of world.json; no geometry."""
 
 from dataclasses import dataclass
 from datetime import date
@@ -66,6 +66,21 @@ class Lamp:
     cone_degrees: float = 90.0
     size: tuple[float, float] = (1.0, 1.0)
     schedule: str = "always"
+
+
+@dataclass(frozen=True)
+class Decal:
+    """A box that hides light from the ground under and beside it: a parked vehicle that the mesh does not have (slide "Ambient occlusion").
+
+    position : (x, y, z) [m], world frame, the middle of its underside
+    size : width, height and length [m] along its own x, y and z
+    yaw_degrees : turn about +Y, counter-clockwise seen from above: 90 turns its x axis to the world's -Z
+    """
+
+    name: str
+    position: tuple[float, float, float]
+    size: tuple[float, float, float]
+    yaw_degrees: float = 0.0
 
 
 def direction_from_azimuth(azimuth_degrees: float, elevation_degrees: float, north_degrees: float) -> Float64:

@@ -17,6 +17,7 @@ from server.metrics import CountRequests, Metrics
 from server.routes import (
     boxes,
     clock,
+    decals,
     distant,
     health,
     lighting,
@@ -76,7 +77,7 @@ def app_of(service: Service) -> FastAPI:
     app.add_middleware(HeadRequests)
     app.add_middleware(TellTotal)
     problems.install(app)
-    stateless = (world, lighting, volume, distant, sectors, probes, preview)
+    stateless = (world, lighting, volume, distant, sectors, probes, decals, preview)
     for resource in (health, metrics_route, *stateless, clock, weather, live_settings, lights, boxes, players, player_volume, live):
         app.include_router(resource.router)
     app.router.routes.append(player_stream.route)

@@ -37,7 +37,7 @@ def show_dataset(path: Path) -> None:
         "sectors": f"{len(world.sectors):,}",
         "sector files": f"{total_bytes:,} bytes" + (f", {total_bytes / len(world.sectors):,.0f} a sector" if world.sectors else ""),
         "bytes per probe": f"{total_bytes / probes:,.0f}" if probes else "no probe",
-        "rooms, lamps": f"{len(world.rooms)}, {len(world.lamps)}",
+        "rooms, lamps, decals": f"{len(world.rooms)}, {len(world.lamps)}, {len(world.decals)}",
         "estimated error": "none was made" if world.estimated_error is None else f"{100 * world.estimated_error:.1f} % (median of sectors)",
     }
     console = Console()

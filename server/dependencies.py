@@ -23,6 +23,7 @@ from server.service import Service
 # Beyond this float32 metres are coarser than a voxel's position needs, and no world reaches it.
 MAX_COORDINATE_M = 1e7
 MAX_PROBE_RADIUS_M = 100.0  # at most 5 x 5 sectors, 25 000 probes
+MAX_DECAL_RADIUS_M = 500.0  # of the talk's 22 300 vehicles on 6 km2 some 3 000
 MAX_PREVIEW_WIDTH = 1920
 MAX_CASCADE = 3  # 800 m wide: some 190 sectors
 
@@ -118,6 +119,13 @@ class ProbesQuery(PositionQuery):
     radius: float = Field(30.0, gt=0, le=MAX_PROBE_RADIUS_M, allow_inf_nan=False, description="metres")
 
 
+class DecalsQuery(StrictQuery):
+    x: Coordinate
+    y: Coordinate
+    z: Coordinate
+    radius: float = Field(100.0, gt=0, le=MAX_DECAL_RADIUS_M, allow_inf_nan=False, description="metres")
+
+
 def _three_numbers(text: str) -> str:
     parse_vector(text)
     return text
@@ -146,7 +154,7 @@ class PreviewQuery(LightingQuery):
         "on", description="off: direct light only; split: left off, right on; error: against a path tracer, in false colour"
     )
     distant: Beyond = Field("on", description="beyond the volumes: the distant texture, or off; client: beyond the eye's one volume")
-    ao: Literal["on", "off"] = Field("off", description="on: what stands within 3 m dims indirect light")
+    ao: Literal["on", "off"] = Field("off", description="on: what stands within 3 m, and decals, dim indirect light")
     view: Literal["lit"] | ViewName = Field("lit", description="what lies behind the picture, in false colours or as spheres")
 
     @model_validator(mode="after")

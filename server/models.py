@@ -94,6 +94,7 @@ class SectorGridReply(BaseModel):
 
 class LimitsReply(BaseModel):
     probe_radius_m: float
+    decal_radius_m: float
     preview_width: int
     probes_per_sector: int
 
@@ -148,3 +149,24 @@ class ProbesReply(BaseModel):
     time: str
     weather: str
     probes: list[ProbeReply]
+
+
+class GradientReply(BaseModel):
+    href: str = Field(description="a PNG of one row, 8 bits, linear: how much is hidden; clamp at its ends")
+    low: float = Field(description="distance from an edge over height at the texture's left end, within the box")
+    high: float = Field(description="the same at its right end, outside")
+    below_m: float = Field(description="ground farther under a box is not darkened")
+
+
+class DecalReply(BaseModel):
+    name: str
+    position: Vector3 = Field(description="world metres, the middle of the box's underside")
+    size: Vector3 = Field(description="metres along the box's own x, y and z")
+    yaw_degrees: float = Field(description="about +Y, counter-clockwise seen from above")
+    world_from_box: list[tuple[float, float, float, float]] = Field(description="four rows: from the box's own metres to the world's")
+    distance: float = Field(description="metres from the queried point to `position`")
+
+
+class DecalsReply(BaseModel):
+    gradient: GradientReply
+    decals: list[DecalReply] = Field(description="closest first")

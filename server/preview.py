@@ -27,7 +27,7 @@ from server.preview_air import background, plain_distance, through_fog
 from server.preview_fog import add_fog_light
 from server.preview_lamps import draw_lamps, lamp_irradiance
 from server.preview_light import Beyond, ServedLight
-from server.preview_occlusion import kept_share
+from server.preview_occlusion import kept_by_decals, kept_share
 from server.preview_scene import PreviewScene
 from server.raycast import RayCaster
 
@@ -117,4 +117,6 @@ def indirect_pixels(pixel: Int64, width: int, indirect: Indirect) -> Int64:
 def indirect_irradiance(rays: RayCaster, served: ServedLight, look: Look, position: Float64, normal: Float32) -> Float64:
     """Indirect light (n, 3) [lx] on surface points (n, 3) [m] with normals (n, 3), as this look has it."""
     light = served.irradiance(position, normal).astype(np.float64)
-    return light * kept_share(rays, position, normal)[:, None] if look.occlusion else light
+    if look.occlusion:
+        light *= (kept_share(rays, position, normal) * kept_by_decals(served.decals, position, normal))[:, None]
+    return light

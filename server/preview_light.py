@@ -24,7 +24,7 @@ from gi_core.lighting import Lighting
 from gi_core.rooms import rooms_of
 from gi_core.settings import Settings
 from gi_core.volume import Volume, sample_coefficients, sample_volume
-from gi_core.world import Room
+from gi_core.world import Decal, Room
 
 Beyond = Literal["on", "off", "client"]
 # The served volume around a place, of the room that a number says; 0 is outdoors.
@@ -55,12 +55,14 @@ class ServedLight:
     distant : what lies beyond the volumes; None: their edge goes on for ever
     player : (3,) [m], the one place that there is a volume around; None: as many as points need, at most MAX_VOLUMES
     rooms : of the world; what lies in one reads its interior volume, and nothing beyond it
+    decals : of the world; they dim indirect light where a picture asks for occlusion
     """
 
     volume_at: VolumeAt
     distant: Distant | None = None
     player: Float64 | None = None
     rooms: tuple[Room, ...] = ()
+    decals: tuple[Decal, ...] = ()
 
     @classmethod
     def of(cls, engine: Engine, lighting: Lighting, settings: Settings, beyond: Beyond, eye: Float64) -> "ServedLight":
@@ -76,7 +78,7 @@ class ServedLight:
                 return engine.volume(inside, lighting, settings)
 
         distant = None if beyond == "off" else engine.distant(settings.light(lighting))
-        return cls(volume_at, distant, eye if beyond == "client" else None, engine.dataset.world.rooms)
+        return cls(volume_at, distant, eye if beyond == "client" else None, engine.dataset.world.rooms, engine.dataset.world.decals)
 
     def irradiance(self, position: Float64, normal: Float32) -> Float32:
         """(n, 3) [lx] on surface points (n, 3) [m] with normals (n, 3), as a client samples it."""

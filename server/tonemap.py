@@ -60,7 +60,7 @@ def png(radiance: Float32, ev100: float) -> bytes:
 
 
 def png_file(picture: UInt8) -> bytes:
-    """A PNG of sRGB (rows, columns, 3)."""
+    """A PNG of sRGB (rows, columns, 3), or of grey (rows, columns)."""
     out = io.BytesIO()
     Image.fromarray(picture).save(out, "PNG", compress_level=6)
     return out.getvalue()

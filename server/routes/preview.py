@@ -27,7 +27,7 @@ def preview(request: Request, service: ServiceDep, query: Annotated[PreviewQuery
     as many volumes as its pixels need, up to 128; `client` shows what one has who holds only the volume around the eye.
 
     `ao=on` dims indirect light by what stands within 3 m, which a volume's voxels cannot see. Against the path tracer it mends corners;
-    where the volumes are too dark already, as under an overcast sky, it makes them darker.
+    where the volumes are too dark already, as under an overcast sky, it makes them darker. The decals of `/v1/decals` dim it besides.
 
     `view`, instead of the light: `albedo`, `normal`, `snow` (how much would stay), `sun` (what it reaches), `sectors`, `voxels` (the class
     of the one in front of each surface); `probes` within 60 m of the eye as spheres that show their light, or the colours of their

@@ -9,7 +9,7 @@ from gi_core.constants import MAX_PROBES_PER_SECTOR, SECTOR_SIZE_M, VOLUME_SHAPE
 from gi_core.dataset import WorldInfo
 from gi_core.weather import WEATHER_RANGES, weather_presets
 from server.caching import Body, conditional, strong_etag
-from server.dependencies import MAX_CASCADE, MAX_PREVIEW_WIDTH, MAX_PROBE_RADIUS_M, NoQuery, ServiceDep
+from server.dependencies import MAX_CASCADE, MAX_DECAL_RADIUS_M, MAX_PREVIEW_WIDTH, MAX_PROBE_RADIUS_M, NoQuery, ServiceDep
 from server.encoding import REPLY_VERSION
 from server.models import BoundsReply, LimitsReply, LocationReply, RoomReply, SectorGridReply, WorldReply, vector3
 
@@ -52,7 +52,12 @@ def world_reply(info: WorldInfo, digest: str) -> WorldReply:
         kinds=["outdoor", "fog", *(["interior"] if info.rooms else [])],
         cascades=list(range(-1 if info.has_fine_voxels else 0, MAX_CASCADE + 1)),
         rooms=[RoomReply(number=n, name=r.name, minimum=r.minimum, maximum=r.maximum) for n, r in enumerate(info.rooms, 1)],
-        limits=LimitsReply(probe_radius_m=MAX_PROBE_RADIUS_M, preview_width=MAX_PREVIEW_WIDTH, probes_per_sector=MAX_PROBES_PER_SECTOR),
+        limits=LimitsReply(
+            probe_radius_m=MAX_PROBE_RADIUS_M,
+            decal_radius_m=MAX_DECAL_RADIUS_M,
+            preview_width=MAX_PREVIEW_WIDTH,
+            probes_per_sector=MAX_PROBES_PER_SECTOR,
+        ),
         dataset={
             "digest": digest,
             "source": info.source,

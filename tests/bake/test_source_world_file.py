@@ -9,7 +9,7 @@ import trimesh
 from bake_jobs.scene import ProbeHint
 from bake_jobs.scene_source import load_scene
 from gi_core.errors import SourceError
-from gi_core.world import Lamp, Location, Room
+from gi_core.world import Decal, Lamp, Location, Room
 
 WORLD = """
 name = "two boxes"
@@ -42,6 +42,12 @@ lumens = 800
 color = [1, 0.5, 0.2]
 range_m = 12.5
 
+[[decal]]
+name = "taxi"
+position = [3, 0.25, 4]
+size = [1.8, 1.25, 4.6]
+yaw_degrees = 30
+
 [[hint]]
 kind = "forbid"
 minimum = [0, 0, 0]
@@ -66,6 +72,7 @@ def test_everything_that_the_file_says_arrives(folder):
     assert scene.location == Location(48.137, 11.575, 519.0, "Europe/Berlin", 29.0, date(2024, 12, 21), "given")
     assert scene.rooms == (Room("hall", (0, 0, 0), (1, 2, 3)),)
     assert scene.lamps == (Lamp("corner", "spot", (1, 2, 3), 800, (1, 0.5, 0.2), 12.5),)
+    assert scene.decals == (Decal("taxi", (3, 0.25, 4), (1.8, 1.25, 4.6), 30),)
     assert scene.hints == (ProbeHint("forbid", (0, 0, 0), (1, 1, 1)),)
     assert len(scene.triangles) == 24
     assert scene.bounds.tolist() == [[-1, -1, -6], [11, 1, 1]]
@@ -109,11 +116,20 @@ WRONG = {
     "a laser": (replaced('"spot"', '"laser"'), "kind: expected point or spot or area, found 'laser'"),
     "a dark lamp": (replaced("lumens = 800", "lumens = -1"), "lumens"),
     "a lamp that is true": (replaced("lumens = 800", "lumens = true"), "lumens"),
+    "a flat decal": (replaced("1.25, 4.6", "0, 4.6"), r"\[\[decal\]\] 1: size: expected three numbers from 0.01 to 1000"),
+    "a decal nowhere": (replaced("[3, 0.25, 4]", "[3, inf, 4]"), "position: expected three numbers"),
+    "a decal of a colour": (replaced("yaw_degrees = 30", "colour = 3"), r"\[\[decal\]\] 1: unknown key colour"),
     "a wish": (replaced('"forbid"', '"please"'), "kind: expected add or forbid"),
     "north in words": (replaced("29.0", '"up"'), "north_degrees"),
     "no source": ("name = 'x'\n", "at least one"),
     "a source that is a table": ("[source]\npath = 'box.ply'\n", r"expected tables \[\[source\]\]"),
 }
+
+
+def test_more_decals_than_a_dataset_holds_are_refused(folder, monkeypatch):
+    monkeypatch.setattr("bake_jobs.world_file.MAX_DECALS", 0)
+    with pytest.raises(SourceError, match="expected at most 0 decals, found 1"):
+        load(folder, WORLD)
 
 
 @pytest.mark.parametrize("case", WRONG)

@@ -16,6 +16,7 @@ from bake_jobs.runner import bake
 from gi_core.dataset import MAX_WORLD_BYTES, Dataset, WorldInfo, write_world
 from gi_core.errors import CorruptFileError, FormatError, FormatVersionError, InputError, SectorlightError
 from gi_core.grid import SectorIndex
+from gi_core.world import Decal
 from server.cli import main
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "v1"
@@ -49,9 +50,9 @@ def test_what_is_written_is_what_is_read(tmp_path):
     assert world.counts["probes"] == sum(facts["probes"] for facts in RECORD["sectors"].values())
 
 
-@pytest.mark.parametrize("version", [0, 4, 999])
+@pytest.mark.parametrize("version", [0, 5, 999])
 def test_another_version_is_named_and_says_what_to_do(version):
-    with pytest.raises(FormatVersionError, match=rf"city/world\.json: dataset version {version}, .* versions 1 to 3; bake it again"):
+    with pytest.raises(FormatVersionError, match=rf"city/world\.json: dataset version {version}, .* versions 1 to 4; bake it again"):
         read(at("version", to=version))
 
 
@@ -69,6 +70,47 @@ def test_version_2_says_what_its_sky_patches_are():
     assert (read(RECORD).sky, read(RECORD | {"version": 2, "sky": "faces"}).version) == ("faces", 1)
     with pytest.raises(CorruptFileError, match="unknown"):
         read(RECORD | {"sky": "faces"})
+
+
+DECAL = {"name": "taxi", "position": [10.0, 0.25, 12.0], "size": [1.8, 1.25, 4.6], "yaw_degrees": 30.0}
+
+
+def test_version_4_has_decals_and_no_other_has():
+    record = RECORD | {"version": 4, "sky": "faces", "decals": [DECAL]}
+    world = read(record)
+    assert world.decals == (Decal("taxi", (10.0, 0.25, 12.0), (1.8, 1.25, 4.6), 30.0),)
+    assert json.loads(json.dumps(world.to_json())) == record
+    # A world without any is written as what it was before there were decals.
+    assert (read(RECORD).decals, read(record | {"decals": []}).version) == ((), 1)
+    with pytest.raises(CorruptFileError, match="unknown"):
+        read(RECORD | {"decals": [DECAL]})
+    with pytest.raises(CorruptFileError, match="missing \\['decals'\\]"):
+        read({name: value for name, value in record.items() if name != "decals"})
+
+
+@pytest.mark.parametrize(
+    ("member", "wrong"),
+    [
+        ("name", 3),
+        ("position", [0, 0]),
+        ("position", [0, 0, float("nan")]),
+        ("size", [1, 1, 0]),
+        ("size", [1, -1, 1]),
+        ("size", [1, 1, 1e6]),
+        ("yaw_degrees", 361),
+        ("yaw_degrees", True),
+        ("colour", 1),
+    ],
+)
+def test_a_decal_that_is_no_box_is_refused_by_name(member, wrong):
+    with pytest.raises(CorruptFileError, match=rf"decals.*{member}"):
+        read(RECORD | {"version": 4, "sky": "faces", "decals": [DECAL | {member: wrong}]})
+
+
+def test_more_decals_than_the_limit_are_refused(monkeypatch):
+    monkeypatch.setattr("gi_core.dataset.MAX_DECALS", 1)
+    with pytest.raises(CorruptFileError, match="decals: expected a list of at most 1"):
+        read(RECORD | {"version": 4, "sky": "faces", "decals": [DECAL] * 2})
 
 
 def test_info_exits_with_2_and_one_line_for_another_version(tmp_path, monkeypatch, capsys):

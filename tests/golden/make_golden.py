@@ -22,7 +22,7 @@ from gi_core.container import write_atomic
 from gi_core.dataset import DISTANT_FILE, VERSION, SectorFacts, WorldInfo, fine_path, geometry_path, sector_path, write_world
 from gi_core.grid import SectorIndex
 from gi_core.sun_table import SunTable
-from gi_core.world import Lamp, Location, Room
+from gi_core.world import Decal, Lamp, Location, Room
 
 BAKE_ID = "0123456789abcdef0123456789abcdef"
 # Coarse enough for a few probes, and more than one feedback probe, so that their weights are stored.
@@ -66,6 +66,11 @@ def tiny_scene() -> Scene:
     )
 
 
+def scene_v4() -> Scene:
+    """The same with a decal: version 4, whatever the settings."""
+    return replace(tiny_scene(), decals=(Decal("taxi", (10.0, 0.25, 12.0), (1.8, 1.25, 4.6), 30.0),))
+
+
 def write_golden(folder: Path, settings: BakeSettings = SETTINGS, scene: Scene | None = None) -> WorldInfo:
     """A whole dataset into a folder; of the tiny scene when no other is given."""
     scene = scene or tiny_scene()
@@ -103,6 +108,7 @@ def write_golden(folder: Path, settings: BakeSettings = SETTINGS, scene: Scene |
         rooms=scene.rooms,
         lamps=scene.lamps,
         dropped_triangles=asdict(scene.dropped),
+        decals=scene.decals,
     )
     write_world(folder, world)
     return world
@@ -110,4 +116,4 @@ def write_golden(folder: Path, settings: BakeSettings = SETTINGS, scene: Scene |
 
 if __name__ == "__main__":
     target = Path(__file__).parent / f"v{VERSION}"
-    print(target, write_golden(target, SETTINGS_V3).counts)
+    print(target, write_golden(target, SETTINGS, scene_v4()).counts)

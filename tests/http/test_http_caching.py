@@ -17,6 +17,8 @@ QUERIES: list[tuple[str, dict[str, Any]]] = [
     ("/v1/volume", {"moment": True, "place": True, "format": "raw"}),
     ("/v1/distant", {"moment": True}),
     ("/v1/probes", {"moment": True, "place": True, "radius": 20}),
+    ("/v1/decals", {"x": 0, "y": 0, "z": 0}),
+    ("/v1/decals/gradient.png", {}),
     ("/v1/preview.png", {"moment": True, "eye": "-10,20,-10", "look": "30,0,30", "width": 64}),
 ]
 

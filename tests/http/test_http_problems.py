@@ -36,6 +36,10 @@ BAD: list[tuple[str, dict[str, str], str]] = [
     ("/v1/sky", {"time": "12:00", "weather": "clear", "format": "hdr"}, "'npy' or 'exr'"),
     ("/v1/probes", {**GOOD, "radius": "1e6"}, "radius"),
     ("/v1/probes", {**GOOD, "radius": "-1"}, "radius"),
+    ("/v1/decals", {"x": "0", "y": "0", "z": "0", "radius": "501"}, "radius"),
+    ("/v1/decals", {"x": "0", "y": "0"}, "z"),
+    ("/v1/decals", GOOD, "time"),
+    ("/v1/decals/gradient.png", {"size": "9"}, "size"),
     ("/v1/sectors/one,two", {}, "x"),
     ("/v1/preview.png", {"time": "12:00", "weather": "clear", "eye": "1,2", "look": "0,0,0"}, "eye"),
     ("/v1/preview.png", {"time": "12:00", "weather": "clear", "eye": "1,2,3", "look": "1,2,3"}, "look"),
@@ -127,7 +131,18 @@ VALUES = (
     | st.text(max_size=30)
     | st.sampled_from(["clear", "12:00", "npy", "raw", "ktx2", "exr", "f16", "rgb9e5", "on", "0,5,9", "1", "-1", "3", "interior", "fog"])
 )
-ROUTES = ["/v1/volume", "/v1/lighting", "/v1/sky", "/v1/distant", "/v1/probes", "/v1/preview.png", "/v1/world", "/v1/sectors", "/readyz"]
+ROUTES = [
+    "/v1/volume",
+    "/v1/lighting",
+    "/v1/sky",
+    "/v1/distant",
+    "/v1/probes",
+    "/v1/preview.png",
+    "/v1/world",
+    "/v1/sectors",
+    "/v1/decals",
+    "/readyz",
+]
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True)

@@ -28,7 +28,7 @@ def test_the_process_is_alive_and_ready(http: httpx.Client) -> None:
 def test_the_api_documents_every_route(http: httpx.Client) -> None:
     paths = set(http.get("/openapi.json").json()["paths"])
     assert paths >= {"/healthz", "/readyz", "/v1/world", "/v1/lighting", "/v1/sky", "/v1/volume", "/v1/distant", "/v1/sectors"}
-    assert paths >= {"/v1/sectors/{x},{z}", "/v1/probes", "/v1/preview.png"}
+    assert paths >= {"/v1/sectors/{x},{z}", "/v1/probes", "/v1/decals", "/v1/decals/gradient.png", "/v1/preview.png"}
     assert http.get("/docs").status_code == 200
 
 

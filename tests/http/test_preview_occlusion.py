@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 
 from gi_core.constants import VOLUME_SHAPE, VOXEL_SIZE_M
+from gi_core.decals import hidden_share
 from gi_core.grid import volume_first_voxel, voxel_centre
+from gi_core.world import Decal
 from server.preview import Look, indirect_irradiance
 from server.preview_light import ServedLight
-from server.preview_occlusion import NEAR_ALBEDO, REACH_M, kept_share, sphere_lattice
+from server.preview_occlusion import NEAR_ALBEDO, REACH_M, kept_by_decals, kept_share, sphere_lattice
 from server.raycast import RayCaster
 
 UP = np.array([[0.0, 1.0, 0.0]], np.float32)
@@ -47,6 +49,27 @@ def test_the_lattice_is_even() -> None:
     np.testing.assert_allclose(np.linalg.norm(lattice, axis=1), 1, rtol=1e-6)
     np.testing.assert_allclose(lattice.mean(axis=0), 0, atol=0.02)
     np.testing.assert_allclose((lattice**2).mean(axis=0), 1 / 3, atol=0.02)
+
+
+def test_decals_multiply_and_the_order_of_pixels_is_kept() -> None:
+    rng = np.random.default_rng(1)
+    points = rng.uniform([0, 0, 0], [40, 0, 40], (2000, 3))
+    parked = [Decal(str(i), (10.0 + 3 * i, 0.25, 12.0), (1.8, 1.25, 4.6), 15.0 * i) for i in range(3)]
+    elsewhere = Decal("far", (500.0, 0.25, 0.0), (1.8, 1.25, 4.6))
+    kept = kept_by_decals([*parked, elsewhere], points, UP.repeat(2000, axis=0))
+    expected = np.prod([1 - hidden_share(decal, points, UP.repeat(2000, axis=0)) for decal in parked], axis=0)
+    np.testing.assert_allclose(kept, expected, rtol=1e-6)
+    assert (kept < 0.2).any()
+    assert (kept == 1).any()
+
+
+def test_without_decals_or_pixels_nothing_is_sorted(monkeypatch: pytest.MonkeyPatch) -> None:
+    def never(_: np.ndarray) -> None:
+        raise AssertionError("sorted")
+
+    monkeypatch.setattr("server.preview_occlusion.PixelCells.of", never)
+    np.testing.assert_array_equal(kept_by_decals((), np.zeros((3, 3)), UP.repeat(3, axis=0)), 1)
+    assert kept_by_decals([Decal("car", (0, 0, 0), (1, 1, 1))], np.zeros((0, 3)), UP[:0]).shape == (0,)
 
 
 def test_only_a_look_that_asks_for_it_has_it() -> None:
