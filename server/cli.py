@@ -190,7 +190,10 @@ def tradeoff(
     ],
     variants: Annotated[
         str,
-        typer.Option(help="Comma-separated presets, groups (rays, cells, placement, spacing, sky, feedback, basis, voxels, sun) or knobs."),
+        typer.Option(
+            help="Comma-separated presets, groups (rays, cells, placement, spacing, sky, feedback, basis, voxels, sun), knobs of standard, "
+            "or ideas: talk with each of standard's added alone."
+        ),
     ] = "",
     sectors: Annotated[str | None, typer.Option(help="X0:X1,Z0:Z1, half open; without it four in the middle.")] = None,
     states: Annotated[str, typer.Option(help="Moments, as `compare` takes them.")] = "noon,low_sun,overcast",
