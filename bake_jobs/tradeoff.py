@@ -1,6 +1,6 @@
 """What accuracy costs: presets and single knobs on one city, each with its error, bytes, bake seconds and tick microseconds.
 
-plan      variants: presets, and ``standard`` with one knob turned
+plan      variants: presets, ``standard`` with one knob turned, and when asked for ``talk`` with one idea of ``standard``'s added
 run       each is baked and compared with the path tracer at the same points: one JSON file a variant, kept when the run is cut off
 measure   ticks of all of them, in turns in one run: on a busy machine only their ratios count
 """
@@ -43,6 +43,16 @@ KNOBS: dict[str, tuple[str, ...]] = {
     "voxels": ("voxel_weights=nearest", "voxel_probes=2", "voxel_levels=2"),
     "sun": ("sun_hour_step_degrees=7.5",),
 }
+TALK, IDEAS = "talk", "ideas"
+# What BASELINE adds to TALK, an idea at a time; and several feedback probes, which it left out again.
+IDEA_KNOBS: tuple[tuple[str, ...], ...] = (
+    ("sky=patches", "sky_patches=96"),
+    ("cells_double_beyond_m=4",),
+    ("basis=sh2",),
+    ("placement=adaptive", "margin_m=3.2"),
+    ("voxel_weights=fitted", "voxel_candidates=24"),
+    ("feedback_probes=3",),
+)
 
 
 @dataclass(frozen=True)
@@ -76,14 +86,16 @@ class Sweep:
 
 
 def plan(names: Sequence[str] = ()) -> list[Variant]:
-    """All variants, or those with some names: a preset's, a group's of KNOBS, or a knob's. Raises InputError for any other name."""
+    """Presets and KNOBS, or those with some names: a preset's, a group's of KNOBS, a knob's, or IDEAS. Raises InputError for others."""
     everything = [(preset, Variant(preset, preset)) for preset in PRESETS]
     everything += [(group, Variant(f"{BASELINE} + {knob}", BASELINE, (knob,))) for group, knobs in KNOBS.items() for knob in knobs]
+    if IDEAS in names:
+        everything += [(IDEAS, Variant(" + ".join((TALK, *knobs)), TALK, knobs)) for knobs in IDEA_KNOBS]
     known = {name for group, variant in everything for name in (group, *variant.knobs)}
     unknown = [name for name in names if name not in known]
     if unknown:
         raise InputError(
-            f"--variants {unknown[0][:60]!r}: expected some of {', '.join((*PRESETS, *KNOBS))}, or a knob as in sky_patches=48"
+            f"--variants {unknown[0][:60]!r}: expected some of {', '.join((*PRESETS, *KNOBS, IDEAS))}, or a knob as in sky_patches=48"
         )
     return [variant for group, variant in everything if not names or {group, *variant.knobs} & set(names)]
 

@@ -109,7 +109,8 @@ def bake(
     knob: Annotated[list[str] | None, typer.Option(help="A setting of the preset, NAME=VALUE as in basis=cube; repeatable.")] = None,
     restart: Annotated[bool, typer.Option("--restart/--resume", help="Bake finished sectors again, or keep them.")] = False,
     target_error: Annotated[
-        float | None, typer.Option(help="Place probes by light until the bake's own estimate is below, as in 0.04; at most 1000 a sector.")
+        float | None,
+        typer.Option(help="Place probes until the bake's estimate of what lies between them is below, as in 0.04; at most 1000 a sector."),
     ] = None,
 ) -> None:
     """Bake a city into a dataset. Interrupted with Ctrl-C, it keeps the sectors that are finished, and the same command bakes the rest."""
@@ -190,7 +191,10 @@ def tradeoff(
     ],
     variants: Annotated[
         str,
-        typer.Option(help="Comma-separated presets, groups (rays, cells, placement, spacing, sky, feedback, basis, voxels, sun) or knobs."),
+        typer.Option(
+            help="Comma-separated presets, groups (rays, cells, placement, spacing, sky, feedback, basis, voxels, sun), knobs of standard, "
+            "or ideas: talk with each of standard's added alone."
+        ),
     ] = "",
     sectors: Annotated[str | None, typer.Option(help="X0:X1,Z0:Z1, half open; without it four in the middle.")] = None,
     states: Annotated[str, typer.Option(help="Moments, as `compare` takes them.")] = "noon,low_sun,overcast",

@@ -1,6 +1,7 @@
 """The sweep of presets and knobs: what is planned, what beats what, and that a run goes on from where it was cut off."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -41,6 +42,16 @@ def test_some_are_chosen_by_preset_group_or_knob():
     assert plan(["sky_patches=48"]) == [Variant("standard + sky_patches=48", "standard", ("sky_patches=48",))]
     with pytest.raises(InputError, match=r"--variants 'speed': expected some of draft, talk, .*, or a knob as in sky_patches=48"):
         plan(["talk", "speed"])
+
+
+def test_ideas_are_added_to_talk_one_by_one_and_all_of_them_make_standard():
+    talk, *alone = plan(["talk", "ideas"])
+    assert talk == Variant("talk", "talk")
+    assert {variant.preset for variant in alone} == {"talk"}
+    assert len({variant.folder for variant in alone}) == len(alone)
+    knobs = [knob for variant in alone for knob in variant.knobs if knob != "feedback_probes=3"]
+    # Rays, trial light and budgets are the same in both presets: only the ideas tell them apart.
+    assert replace(with_knobs(settings_for("talk"), knobs), preset="standard") == settings_for("standard")
 
 
 def test_the_front_is_what_nothing_beats():
