@@ -18,7 +18,7 @@ from gi_core.layout import NO_SAMPLE, SHADOW_ROW_TEXELS
 from gi_core.relight_launch import SURFELS_PER_GROUP
 from gi_core.resident_sector import ResidentSector
 from gi_core.sector import counts
-from gi_core.shadow_plan import MAP_TEXELS, ShadowPlan, box_triangles, oldest_fresh, triangle_records
+from gi_core.shadow_plan import FRESH_DEGREES, MAP_TEXELS, ShadowPlan, box_triangles, is_near, oldest_fresh, triangle_records
 
 NOTHING_DRAWN = np.float32(-1e30)  # as in shadow_map.h
 # Each work-item looks at every triangle. A CPU wants few of them, though more than cores; a GPU wants many.
@@ -27,6 +27,8 @@ CPU_ITEMS_PER_CORE, GPU_ITEMS = 2, 256
 KEPT_BYTES = 1 << 25
 # A sector's looks at maps are numbered with 16 bits; its samples start anew when they run out.
 LAST_NUMBER = 0xFFFF
+# Looks at maps for suns this close are as old as the first of them: a box that moves has a map drawn at every tick, under one sun.
+_ONE_LOOK_DEGREES = FRESH_DEGREES / 16
 
 
 class SunSamples:
@@ -52,7 +54,7 @@ class SunSamples:
         self.number = 0
         self._forget = device.shared_kernel("forget_sun_samples")
         self._looks: list[tuple[int, Float64]] = []
-        """Numbers and suns of the looks that samples may be from, oldest first."""
+        """Numbers and suns of the looks that samples may be from, oldest first; of a run of looks at nearly one sun the first."""
         self._framed: ShadowPlan | None = None
         self._frame: AnyArray
 
@@ -84,7 +86,8 @@ class SunSamples:
             cl.enqueue_fill_buffer(device.queue, self.sampled_in, np.uint16(0), 0, self.sampled_in.size)
             self.number, self._looks = 0, []
         self.number += 1
-        self._looks.append((self.number, to_sun))
+        if not self._looks or not is_near(self._looks[-1][1], to_sun, _ONE_LOOK_DEGREES):
+            self._looks.append((self.number, to_sun))
         return self._oldest_kept(to_sun)
 
     def forget_old(self, to_sun: Float64) -> bool:

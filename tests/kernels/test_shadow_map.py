@@ -196,6 +196,17 @@ def test_samples_grow_old_between_looks(device, make_sector):
     assert (samples.read()[0] == NO_SAMPLE).all()
 
 
+def test_looks_at_a_map_at_every_tick_are_not_all_remembered(device, make_sector):
+    """As when a box moves for minutes; and samples are forgotten a little early at most, never late."""
+    samples = samples_of(device, make_sector, 5)
+    suns = [towards(50.0 + step / 3000) for step in range(9000)]
+    kept = [samples.look(sun) for sun in suns]
+    assert len(samples._looks) <= 18
+    degrees = np.degrees(np.arccos(np.minimum(np.array(suns)[np.array(kept) - 1] @ suns[-1], 1)))
+    assert degrees[-1] <= 1
+    assert degrees[-1] > 1 - 2 / 16
+
+
 def test_samples_start_anew_when_looks_run_out_of_numbers(device, make_sector):
     shadow_map = drawn(device, random_city(3), towards(50.0))
     samples, other = samples_of(device, make_sector, 5), samples_of(device, make_sector, 5)
