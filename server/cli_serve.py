@@ -10,6 +10,7 @@ from starlette.applications import Starlette
 
 from gi_core.errors import InputError
 from server.app import create_app
+from server.heap import give_memory_back
 from server.player_streams import MAX_MESSAGE_BYTES, PING_S
 from server.service import Service
 from server.settings import Settings
@@ -31,6 +32,7 @@ def run(dataset_path: Path, settings: Settings) -> None:
     # Bound before anything slow, so that a taken port is known at once; listening starts when the application is ready.
     with bind(settings.host, settings.port) as listener:
         sys.setswitchinterval(SWITCH_INTERVAL_S)
+        give_memory_back()
         app = create_app(dataset_path, settings)
         host = f"[{settings.host}]" if ":" in settings.host else settings.host
         print(f"Serving {dataset_path} at http://{host}:{listener.getsockname()[1]}/", flush=True)
