@@ -4,8 +4,9 @@ A world that was built before is warm in a second or two; kernels that are new t
 """
 
 import asyncio
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, Protocol
 
 from fastapi import Depends
 
@@ -46,6 +47,13 @@ TickerDep = Annotated[Ticker, Depends(_for_reading)]
 WritingTickerDep = Annotated[Ticker, Depends(_for_writing)]
 
 
+class Kept(Protocol):
+    """A player, a light, a box: whether it is back after a restart."""
+
+    @property
+    def kept(self) -> bool: ...
+
+
 @dataclass(frozen=True)
 class Applied:
     """What a command did: the tick from which it holds, and the state right after it."""
@@ -70,6 +78,22 @@ async def keep(service: Service, is_concerned: bool) -> None:
     """Write the state file when something in it has changed."""
     if is_concerned:
         await asyncio.to_thread(service.live.keep)
+
+
+async def apply_to(
+    service: Service, ticker: Ticker, find: Callable[[LiveState], Kept], command: Callable[[LiveState], LiveState], *, stays: bool
+) -> Applied:
+    """``apply`` a command to what ``find`` finds, and write the state file where that was kept or, if it ``stays``, is from now on."""
+    was_kept = False
+
+    def noted(state: LiveState, _: int) -> LiveState:
+        nonlocal was_kept
+        was_kept = find(state).kept
+        return command(state)
+
+    applied = await apply(ticker, noted)
+    await keep(service, was_kept or (stays and find(applied.state).kept))
+    return applied
 
 
 def reply_to(applied: Applied, record: dict[str, Any]) -> dict[str, Any]:

@@ -9,9 +9,8 @@ from fastapi.responses import JSONResponse
 
 from server.boxes_json import box_changed, box_from_json, box_to_json
 from server.dependencies import NoQuery, ServiceDep
-from server.live_access import TickerDep, WritingTickerDep, apply, keep, reply_to
+from server.live_access import TickerDep, WritingTickerDep, apply, apply_to, keep, reply_to
 from server.live_models import BoxesReply, BoxReply, GoneReply
-from server.live_state import LiveState
 from server.write_access import WRITE, JsonBody, body_schema
 
 router = APIRouter(prefix="/v1/boxes", tags=["live world"])
@@ -66,30 +65,18 @@ async def change_box(
     """Move a box, turn it, or change anything else of it; what the body does not name stays."""
     if body.get("keep") is True:
         service.live.kept.expect_possible()
-    was_kept = False
-
-    def command(state: LiveState, tick: int) -> LiveState:
-        nonlocal was_kept
-        before = state.box(name)
-        was_kept = before.kept
-        return state.with_box(box_changed(before, body, "box"), new=False)
-
-    applied = await apply(ticker, command)
-    changed = applied.state.box(name)
-    await keep(service, was_kept or changed.kept)
-    return reply_to(applied, box_to_json(changed))
+    applied = await apply_to(
+        service,
+        ticker,
+        lambda state: state.box(name),
+        lambda state: state.with_box(box_changed(state.box(name), body, "box"), new=False),
+        stays=True,
+    )
+    return reply_to(applied, box_to_json(applied.state.box(name)))
 
 
 @router.delete("/{id}", response_model=GoneReply, dependencies=WRITE)
 async def remove_box(service: ServiceDep, ticker: WritingTickerDep, name: IdInPath, _: Annotated[NoQuery, Query()]) -> dict[str, Any]:
     """One box less."""
-    was_kept = False
-
-    def command(state: LiveState, tick: int) -> LiveState:
-        nonlocal was_kept
-        was_kept = state.box(name).kept
-        return state.without_box(name)
-
-    applied = await apply(ticker, command)
-    await keep(service, was_kept)
+    applied = await apply_to(service, ticker, lambda state: state.box(name), lambda state: state.without_box(name), stays=False)
     return {"id": name, "tick": applied.tick}

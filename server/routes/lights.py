@@ -9,9 +9,8 @@ from fastapi.responses import JSONResponse
 
 from server.dependencies import NoQuery, ServiceDep
 from server.lamps_json import lamp_changed, lamp_from_json, lamp_to_json
-from server.live_access import TickerDep, WritingTickerDep, apply, keep, reply_to
+from server.live_access import TickerDep, WritingTickerDep, apply, apply_to, keep, reply_to
 from server.live_models import GoneReply, LightReply, LightsReply
-from server.live_state import LiveState
 from server.write_access import WRITE, JsonBody, body_schema
 
 router = APIRouter(prefix="/v1/lights", tags=["live world"])
@@ -75,30 +74,18 @@ async def change_light(
     """Move a lamp, or change anything else of it; what the body does not name stays."""
     if body.get("keep") is True:
         service.live.kept.expect_possible()
-    was_kept = False
-
-    def command(state: LiveState, tick: int) -> LiveState:
-        nonlocal was_kept
-        before = state.lamp(name)
-        was_kept = before.kept
-        return state.with_lamp(lamp_changed(before, body, "light"), new=False)
-
-    applied = await apply(ticker, command)
-    lamp = applied.state.lamp(name)
-    await keep(service, was_kept or lamp.kept)
-    return reply_to(applied, lamp_to_json(lamp))
+    applied = await apply_to(
+        service,
+        ticker,
+        lambda state: state.lamp(name),
+        lambda state: state.with_lamp(lamp_changed(state.lamp(name), body, "light"), new=False),
+        stays=True,
+    )
+    return reply_to(applied, lamp_to_json(applied.state.lamp(name)))
 
 
 @router.delete("/{id}", response_model=GoneReply, dependencies=WRITE)
 async def remove_light(service: ServiceDep, ticker: WritingTickerDep, name: IdInPath, _: Annotated[NoQuery, Query()]) -> dict[str, Any]:
     """One lamp less. A lamp of the dataset is back after a restart."""
-    was_kept = False
-
-    def command(state: LiveState, tick: int) -> LiveState:
-        nonlocal was_kept
-        was_kept = state.lamp(name).kept
-        return state.without_lamp(name)
-
-    applied = await apply(ticker, command)
-    await keep(service, was_kept)
+    applied = await apply_to(service, ticker, lambda state: state.lamp(name), lambda state: state.without_lamp(name), stays=False)
     return {"id": name, "tick": applied.tick}

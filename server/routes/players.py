@@ -10,9 +10,9 @@ from fastapi.responses import JSONResponse
 
 from gi_core.errors import InputError
 from server.dependencies import NoQuery, ServiceDep
-from server.live_access import TickerDep, WritingTickerDep, apply, keep, reply_to
+from server.live_access import TickerDep, WritingTickerDep, apply, apply_to, keep, reply_to
 from server.live_models import GoneReply, PlayerReply, PlayersReply
-from server.live_state import LivePlayer, LiveState
+from server.live_state import LivePlayer
 from server.players import player_from_json
 from server.write_access import WRITE, JsonBody, body_schema
 
@@ -77,15 +77,7 @@ def player(ticker: TickerDep, name: IdInPath, _: Annotated[NoQuery, Query()]) ->
 @router.delete("/{id}", response_model=GoneReply, dependencies=WRITE)
 async def remove_player(service: ServiceDep, ticker: WritingTickerDep, name: IdInPath, _: Annotated[NoQuery, Query()]) -> dict[str, Any]:
     """One player less; its streams end."""
-    was_kept = False
-
-    def command(state: LiveState, tick: int) -> LiveState:
-        nonlocal was_kept
-        was_kept = state.player(name).kept
-        return state.without_player(name)
-
-    applied = await apply(ticker, command)
-    await keep(service, was_kept)
+    applied = await apply_to(service, ticker, lambda state: state.player(name), lambda state: state.without_player(name), stays=False)
     return {"id": name, "tick": applied.tick}
 
 
