@@ -61,7 +61,7 @@ class Engine:
     """What views use of one. probe_at : (3,) [m] of one probe, whose six faces are 100 to 600 lx"""
 
     def __init__(self, voxel_class: int = VOXEL_OUTDOORS, probe_at: tuple[float, float, float] | None = None, room: int = 0) -> None:
-        self.dataset = SimpleNamespace(world=SimpleNamespace(bounds=np.array([[-20.0, 0, -20], [20, 10, 20]]), rooms=()))
+        self.dataset = SimpleNamespace(world=SimpleNamespace(bounds=np.array([[-20.0, 0, -20], [20, 10, 20]]), rooms=(), decals=()))
         self.lamps = ()
         self.voxel_class, self.probe_at, self.room = voxel_class, probe_at, room
 
