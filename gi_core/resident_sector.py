@@ -90,6 +90,7 @@ class ResidentSector:
         self._no_bounces: cl.Buffer | None = None
         self._is_lit_anew = True
         self._launch: tuple[About, Launch] | None = None
+        """Of the sector's own passes."""
 
     @property
     def nbytes(self) -> int:
@@ -173,13 +174,16 @@ class ResidentSector:
     def enqueue(self, queue: cl.CommandQueue, passes: int) -> None:
         """Enqueue passes, each one more bounce on the cubes that the sector holds. ``light`` comes first."""
         if self.sector.probe_count:
-            self._relight(queue, passes, self.bounce_starts, self.cubes)
+            about = self._about(self.bounce_starts, self.cubes)
+            if self._launch is None or self._launch[0] != about:
+                self._launch = about, relight_launch(self, about)
+            self._run(self._launch[1], queue, passes)
 
     def enqueue_first_bounce(self, cubes: cl.Buffer) -> None:
         """Enqueue what one pass from darkness gives, into other cubes than the sector's own: sky and the first surface alone."""
         if self.sector.probe_count:
             self._no_bounces = self._no_bounces or self.device.allocate(4 * (self.sector.brick_count + 1))
-            self._relight(self.device.queue, 1, self._no_bounces, cubes)
+            self._run(relight_launch(self, self._about(self._no_bounces, cubes)), self.device.queue, 1)
 
     def converted(self, basis: str, cubes: cl.Buffer | None = None) -> cl.Buffer:
         """The sector's light, or other ``cubes`` of its probes, in a basis that is served: a buffer that the next call writes again.
@@ -227,15 +231,16 @@ class ResidentSector:
             padded[..., :3] = cubes
             cl.enqueue_copy(self.device.queue, self.cubes, padded)
 
-    def _relight(self, queue: cl.CommandQueue, passes: int, bounce_starts: cl.Buffer | None, cubes: cl.Buffer) -> None:
-        light = self._light
-        assert light is not None
+    def _about(self, bounce_starts: cl.Buffer | None, cubes: cl.Buffer) -> About:
+        assert self._light is not None
+        given = self._light.given
         glow = self.brick_emission if self.lamps_on_bricks is None else self.lamps_on_bricks
-        snow = light.given.snow if self._has_snow else 0.0
-        about = About(len(light.given.lights), snow, glow, self.sun_sample, self.sun_share, self.bounces, bounce_starts, cubes)
-        if self._launch is None or self._launch[0] != about:
-            self._launch = about, relight_launch(self, about)
-        self._launch[1](queue, passes, self._is_lit_anew, light)
+        snow = given.snow if self._has_snow else 0.0
+        return About(len(given.lights), snow, glow, self.sun_sample, self.sun_share, self.bounces, bounce_starts, cubes)
+
+    def _run(self, launch: Launch, queue: cl.CommandQueue, passes: int) -> None:
+        assert self._light is not None
+        launch(queue, passes, self._is_lit_anew, self._light)
         self._is_lit_anew = False
 
     def _make_room_for_sun(self, lights: int) -> None:

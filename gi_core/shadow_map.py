@@ -132,8 +132,7 @@ class ShadowMap:
         self._front, self._back = (cl.Buffer(device.context, cl.mem_flags.READ_WRITE, 4 * MAP_TEXELS * SHADOW_ROW_TEXELS) for _ in range(2))
         self._draw = device.shared_kernel("draw_shadow_map")
         self._sample = device.shared_kernel("sample_shadow_map")
-        is_cpu = device.device.type & cl.device_type.CPU
-        self._rows_apart = CPU_ITEMS_PER_CORE * device.device.max_compute_units if is_cpu else GPU_ITEMS
+        self._rows_apart = CPU_ITEMS_PER_CORE * device.device.max_compute_units if device.is_processor else GPU_ITEMS
         self._triangles: OrderedDict[SectorIndex, tuple[cl.Buffer, int]] = OrderedDict()
         self._kept_bytes = 0
 
