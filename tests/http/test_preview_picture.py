@@ -216,7 +216,7 @@ def test_tone_mapping_is_monotone_and_bounded() -> None:
 pixels_of_any_radiance = arrays(np.float32, (3, 4, 3), elements=st.floats(-(2.0**127), 2.0**127, width=32))
 
 
-@given(pixels_of_any_radiance, st.floats(-60, 140))
+@given(pixels_of_any_radiance, st.floats(-60, 140, exclude_max=True))
 @example(np.full((3, 4, 3), -1.02e38, np.float32), -1.0)  # beyond float32 once it is exposed
 @settings(max_examples=100, deadline=None)
 def test_any_finite_radiance_makes_a_picture(radiance: np.ndarray, sky_ev100: float) -> None:
