@@ -86,7 +86,8 @@ def test_no_header_gives_a_traceback(kind, data):
             for step in path[:-1]:
                 parent = parent[step]
             if data.draw(st.booleans()):
-                parent[path[-1]] = data.draw(VALUES)
+                # A copy: the next change may go into it, and one that was put into itself is nothing a file can hold.
+                parent[path[-1]] = copy.deepcopy(data.draw(VALUES))
             else:
                 del parent[path[-1]]
         except (KeyError, IndexError, TypeError):
