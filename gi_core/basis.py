@@ -52,6 +52,12 @@ FEEDBACK = {
 }
 
 
+def brightness(values: Float32, basis: str) -> Float32:
+    """Luminance of what arrives from all directions together, (B, n, 3) [lx] -> (n,), up to a factor that each basis has."""
+    light = values.mean(axis=0) if basis == "cube" else values[0]
+    return np.asarray(light @ LUMINANCE_FROM_RGB.astype(np.float32), np.float32)
+
+
 def basis_of_size(size: int) -> str:
     """The basis with this many coefficients. Raises InputError where there is none."""
     for name, coefficients in BASIS_SIZES.items():

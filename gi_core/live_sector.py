@@ -1,5 +1,6 @@
 """A resident sector of the live world: its light, which goes on from tick to tick, and what of it is shown."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,7 +10,7 @@ import numpy as np
 import pyopencl as cl
 
 from gi_core.arrays import Float32, Float64
-from gi_core.basis import basis_of_size, from_axes
+from gi_core.basis import basis_of_size, brightness, from_axes
 from gi_core.device import Device
 from gi_core.light_blend import LightVector
 from gi_core.light_geometry import ShadowGeometry
@@ -23,6 +24,7 @@ from gi_core.settings import Settings
 from gi_core.shadow_map import ShadowMap, SunSamples
 from gi_core.shadow_plan import FRESH_DEGREES, ShadowPlan, is_near
 from gi_core.sky_patches import face_exitance
+from gi_core.spectrum import LUMINANCE_FROM_RGB
 from gi_core.world import Lamp
 
 # After a change this large, as a share, a relight makes several passes, so that bounces follow at once.
@@ -33,6 +35,11 @@ FIRST_PASSES = 4
 # A second at 30 Hz, so that nothing pops when a sector arrives late, or when its sun's visibility has another source: in half of that, a
 # voxel that ends ten times as bright moves by a third in its first ticks.
 FADE_TICKS = 30
+# The most that a probe's light from any side moves by in a tick of a fade, as a share of its brightness, where FADE_TICKS are not more
+# than enough: a small change is over sooner, and volumes that read it need not be filled for the rest.
+FADE_STEP = 0.05
+# A probe this much darker than the mean counts as this bright: nobody sees what doubles there.
+_FADE_FLOOR_OF_MEAN = 0.01
 # What is shown of a sector lags behind its light by less than this share of its brightest probe: volumes need not be filled anew for what
 # nobody would see, which a slow sun moves in a second or more.
 UNSHOWN_CHANGE = 2e-4
@@ -100,6 +107,8 @@ class LiveSector:
         self._faded = 0
         self._blended_faded = 0
         """``_faded`` when what is shown was last blended."""
+        self._starts_fade = False
+        """Whether the relight under way makes what it fades to, from what ``_cubes`` are."""
         self._cubes: Float32 = np.zeros((sector.probe_count, sector.basis_size, 3), np.float32)
         self.host_nbytes = self.resident.host_nbytes + self._cubes.nbytes
         """Bytes in the host's memory."""
@@ -186,6 +195,9 @@ class LiveSector:
         after = self.resident.read_cubes()
         peak = float(after.max(initial=0.0))
         moved = float(np.abs(after - self._cubes).max(initial=0.0))
+        if self._starts_fade:
+            self._starts_fade = False
+            self._faded = self._blended_faded = FADE_TICKS - fade_ticks(self._cubes, after)
         self._cubes, self.is_lit = after, True
         share = moved / peak if peak > 0 else float(moved > 0)
         self._unshown += share
@@ -276,6 +288,7 @@ class LiveSector:
         if self._shown is None:
             self._shown = self._device.allocate(self.resident.cubes.size)
             cl.enqueue_copy(self._device.queue, self._shown, self.resident.cubes)
+            self._starts_fade = True
         self._faded = self._blended_faded = 0
 
     def _expire_samples(self, light: LiveLight) -> None:
@@ -297,6 +310,17 @@ class LiveSector:
     def _is_whole_in(self, plan: ShadowPlan) -> bool:
         """Whether at most far surfels, which stand on others' ground, lack samples of a map: what they change is not seen."""
         return plan.covers_whole(self.resident.sector.index)
+
+
+def fade_ticks(before: Float32, after: Float32) -> int:
+    """In how many ticks, of FADE_TICKS at most, probes (P, B, 3) [lx] go over from one light to another by FADE_STEP or less in each."""
+    basis = basis_of_size(before.shape[1])
+    old, new = (brightness(cubes.swapaxes(0, 1), basis) for cubes in (before, after))
+    if not new.any():
+        return FADE_TICKS
+    darker = np.maximum(np.minimum(old, new), _FADE_FLOOR_OF_MEAN * new.mean())
+    moved = np.abs((after - before) @ LUMINANCE_FROM_RGB.astype(np.float32)).max(axis=1)
+    return min(max(math.ceil(float((moved / darker).max()) / FADE_STEP), 1), FADE_TICKS)
 
 
 def _bounds(sector: Sector) -> tuple[Float64, Float64]:

@@ -4,7 +4,7 @@ On the device it lies like a torus along x and z: a voxel's place is its lattice
 leaves in sight stays where it is, and only columns that come into sight are filled.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -47,14 +47,14 @@ class _Layout:
     """What does not change while the volume stays and the same sectors are there.
 
     first : (3,) where it stands; present : sectors that are there, and lit
-    boxes : parts that they fill; mask : all classes
+    boxes : parts that they fill, each with the parts of it that the layout before did not have; mask : all classes
     placeholders : sectors of the world that are not there, with the columns (z, x) that stand for each
     outside : columns (z, x) without a sector, and for each the column that it copies
     """
 
     first: Int64
     present: frozenset[SectorIndex]
-    boxes: tuple[SectorBox, ...]
+    boxes: tuple[tuple[SectorBox, Sequence[SectorBox]], ...]
     mask: UInt8
     placeholders: tuple[tuple[SectorIndex, slice, slice], ...]
     outside: tuple[Int64, Int64] | None
@@ -71,6 +71,8 @@ class LiveVolume:
         """Sectors of the world that it reads, there or not."""
         self._device = device
         self._first: Int64 = np.zeros(3, np.int64)
+        self._boxes: Sequence[SectorBox] = ()
+        """Of all sectors around, of the world or not."""
         self._layout: _Layout | None = None
         """Of the last filling."""
         self._arrays = arrays or volume_arrays(basis)
@@ -84,19 +86,20 @@ class LiveVolume:
 
     def move(self, first_voxel: Int64, known: frozenset[SectorIndex]) -> None:
         """Stand elsewhere: the lattice index (3,) of voxel (0, 0, 0). ``known``: sectors of the world."""
-        self._first = first_voxel
-        self.touched = tuple(box.index for box in plan_boxes(first_voxel) if box.index in known)
+        self._first, self._boxes = first_voxel, plan_boxes(first_voxel)
+        self.touched = tuple(box.index for box in self._boxes if box.index in known)
 
     def enqueue(self, residents: Mapping[SectorIndex, LiveSector], shown: ShownCubes) -> None:
         """Enqueue the filling of what has changed; ``publish`` must follow."""
         present = frozenset(i for i in self.touched if i in residents and residents[i].is_lit)
         before = self._layout
-        if before is None or present != before.present or self._first is not before.first:
-            self._layout = _lay_out(self._first, residents, frozenset(self.touched), present, before)
+        is_new = before is None or present != before.present or self._first is not before.first
+        if is_new:
+            self._layout = _lay_out(self._first, self._boxes, residents, frozenset(self.touched), present, before)
         assert self._layout is not None
-        for box in self._layout.boxes:
+        for box, new_parts in self._layout.boxes:
             sector = residents[box.index]
-            parts = [box] if sector.shown_at > self._filled_at else _new_parts(box, self._first, before)
+            parts = (box,) if sector.shown_at > self._filled_at else new_parts if is_new else ()
             cubes = shown(sector) if parts else None
             for part in parts:
                 record = box_record(part, sector.resident.sector)
@@ -155,11 +158,6 @@ def came_into_sight(box: SectorBox, first: Int64, before: Int64) -> list[SectorB
     return parts
 
 
-def _new_parts(box: SectorBox, first: Int64, before: _Layout | None) -> list[SectorBox]:
-    """The parts of a lit sector's box that a layout did not have."""
-    return [box] if before is None or box.index not in before.present else came_into_sight(box, first, before.first)
-
-
 def _runs(first: int, count: int) -> list[tuple[slice, slice]]:
     """Columns of one axis of a volume at a lattice index: where in the volume, and where in the torus, in two runs at most."""
     at = first % count
@@ -173,25 +171,28 @@ def volume_arrays(basis: str) -> RecycledArrays:
 
 def _lay_out(
     first: Int64,
+    around: Sequence[SectorBox],
     residents: Mapping[SectorIndex, LiveSector],
     known: frozenset[SectorIndex],
     present: frozenset[SectorIndex],
     before: _Layout | None,
 ) -> _Layout:
-    """``before`` : of the same volume, whose classes of the same sectors are taken over."""
+    """``around`` : the volume's boxes; ``before`` : of the same volume, whose classes of the same sectors are taken over."""
     mask = np.full(VOLUME_SHAPE, VOXEL_NO_SECTOR, np.uint8)
     has_light = np.zeros(VOLUME_SHAPE[1:], bool)
     if before is not None:
         _copy_moved(before.mask, mask, first - before.first)
     boxes, placeholders = [], []
-    for box in plan_boxes(first):
+    for box in around:
         slices = box_slices(box)
         if box.index in present:
             sector = residents[box.index].resident.sector
-            for part in _new_parts(box, first, before):
+            # One that has just arrived, or was just lit, is new as a whole.
+            new_parts = [box] if before is None or box.index not in before.present else came_into_sight(box, first, before.first)
+            for part in new_parts:
                 mask[box_slices(part)] = box_mask(part, sector)
             if sector.probe_count:
-                boxes.append(box)
+                boxes.append((box, new_parts))
                 has_light[slices[1:]] = True
         else:
             mask[slices] = VOXEL_NO_SECTOR

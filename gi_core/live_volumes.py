@@ -54,7 +54,8 @@ class LiveVolumes:
     @property
     def missing(self) -> tuple[SectorIndex, ...]:
         """Sectors that published volumes read and that are not there, or not lit yet."""
-        return tuple(index for index in self.looked_at if not self._is_lit(index))
+        residents = self._residents
+        return tuple(index for index in self.looked_at if index not in residents or not residents[index].is_lit)
 
     def note(self, tick: int, ids: Sequence[str], positions: Float64, changed: Sequence[SectorIndex]) -> None:
         """Find what has to be filled: for players ``ids`` (p) at positions (p, 3) [m], and sectors that show something else now."""
@@ -115,8 +116,10 @@ class LiveVolumes:
         for index in volume.touched:
             self._readers[index].discard(name)
         if volume.published is not None:
-            self.looked_at.subtract(volume.touched)
-            self.looked_at = +self.looked_at
+            for index in volume.touched:
+                self.looked_at[index] -= 1
+                if not self.looked_at[index]:
+                    del self.looked_at[index]
 
     def _is_lit(self, index: SectorIndex) -> bool:
         return index in self._residents and self._residents[index].is_lit

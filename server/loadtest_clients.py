@@ -13,8 +13,8 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import WebSocketException
 
 from gi_core.arrays import Float32, UInt8
+from gi_core.basis import brightness
 from gi_core.constants import VOXEL_INDOORS, VOXEL_OUTDOORS
-from gi_core.spectrum import LUMINANCE_FROM_RGB
 from server.frame_prefix import FrameKind
 from server.loadtest_record import Recorder
 from server.stream_header import FrameLostError, StreamError, parse_header
@@ -89,12 +89,6 @@ def _pops_of(frame: Frame, decoder: VolumeDecoder, basis: str, bound: float) -> 
     floor = POP_FLOOR_OF_MEAN * float(brightness(flat[:, ::16], basis).mean())
     after = np.take(flat, frame.chosen, axis=1)
     return count_pops(frame.before, after, decoder.mask.reshape(-1)[frame.chosen], floor, basis, bound)
-
-
-def brightness(values: Float32, basis: str) -> Float32:
-    """Luminance of what arrives from all directions together, (B, n, 3) [lx] -> (n,), up to a factor that each basis has."""
-    light = values.mean(axis=0) if basis == "cube" else values[0]
-    return np.asarray(light @ LUMINANCE_FROM_RGB.astype(np.float32), np.float32)
 
 
 def count_pops(before: Float32, after: Float32, classes: UInt8, floor: float, basis: str, bound: float) -> int:

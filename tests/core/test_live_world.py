@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from gi_core import stream
+from gi_core.basis import brightness
 from gi_core.constants import VOXEL_INDOORS, VOXEL_OUTDOORS, VOXEL_SIZE_M
 from gi_core.dataset import Dataset, sector_path
 from gi_core.device import Device, shared_device
@@ -24,7 +25,7 @@ from gi_core.light_blend import LightVector
 from gi_core.light_geometry import ShadowGeometry
 from gi_core.lighting import Lighting
 from gi_core.lights import lamps_on
-from gi_core.live_sector import FADE_TICKS, UNSHOWN_CHANGE, LiveLight, LiveSector
+from gi_core.live_sector import FADE_STEP, FADE_TICKS, UNSHOWN_CHANGE, LiveLight, LiveSector, fade_ticks
 from gi_core.live_volume import PublishedVolume
 from gi_core.live_volumes import HELD_TICKS
 from gi_core.live_world import LiveWorld, TickPlayers, TickReport
@@ -33,6 +34,7 @@ from gi_core.relight_input import relight_input
 from gi_core.resident_sector import ResidentSector
 from gi_core.settings import NEUTRAL, Settings
 from gi_core.shadow_plan import LOWEST_SUN_DEGREES, is_near
+from gi_core.spectrum import LUMINANCE_FROM_RGB
 from gi_core.stream_plan import StreamOptions
 from gi_core.world import Lamp
 
@@ -74,13 +76,20 @@ def at(*places: np.ndarray, velocity=(0.0, 0.0, 0.0)) -> TickPlayers:
 
 
 def largest_step(before: PublishedVolume, after: PublishedVolume) -> float:
-    """By how much light [lx] changed in any voxel of free air that two volumes share; the second lies as far along x or further."""
+    """By how much a cube's luminance changed on any side, as a share of its brightness, in any voxel of free air that two volumes share;
+    the second lies as far along x or further."""
     shift = after.first_voxel - before.first_voxel
     assert shift[0] >= 0
     assert not shift[1:].any()
     count = before.values.shape[3] - int(shift[0])
-    change = np.abs(after.values[:, :, :, :count] - before.values[:, :, :, -count:]).max(axis=(0, 4))
-    return float(change[np.isin(after.mask[:, :, :count], (VOXEL_OUTDOORS, VOXEL_INDOORS))].max())
+    free = np.isin(after.mask[:, :, :count], (VOXEL_OUTDOORS, VOXEL_INDOORS))
+    return largest_change(before.values[:, :, :, -count:][:, free], after.values[:, :, :, :count][:, free])
+
+
+def largest_change(before: np.ndarray, after: np.ndarray) -> float:
+    """By how much cubes' luminance (6, n, 3) [lx] differs on any side, as a share of the darker cube's brightness."""
+    darker = np.minimum(brightness(before, "cube"), brightness(after, "cube"))
+    return float((np.abs((after - before) @ LUMINANCE_FROM_RGB).max(axis=0) / darker).max())
 
 
 def is_exact(world: LiveWorld) -> bool:
@@ -600,6 +609,29 @@ def unbound(world: LiveWorld) -> bool:
     return all(s.sampled_of is None and s.resident.sun_sample is None for s in world.streamer.residents.values())
 
 
+@pytest.mark.parametrize(
+    ("factor", "ticks"),
+    [(1.0, 1), (1.02, 1), (1.24, 5), (1 / 1.24, 5), (3.0, FADE_TICKS), (np.inf, FADE_TICKS), (0.0, FADE_TICKS)],
+)
+def test_small_changes_fade_sooner(factor, ticks):
+    """One of five probes changes; or all were dark."""
+    before = np.full((5, 6, 3), 1000.0, np.float32)
+    after = before.copy()
+    if np.isinf(factor):
+        before[:] = 0.0
+    else:
+        after[2] *= factor
+    assert fade_ticks(before, after) == ticks
+    assert fade_ticks(before[:0], after[:0]) == FADE_TICKS
+
+
+def way_to_query(run: "Run", light: LiveLight, place: np.ndarray, engine) -> float:
+    """The largest change between a settled world with a shadow map and a query, which has none, in the free air around a place."""
+    query = engine.volume(place, light.lighting)
+    free = np.isin(query.mask, (VOXEL_OUTDOORS, VOXEL_INDOORS))
+    return largest_change(query.values[:, free], run.settle(at(place), light)[:, free])
+
+
 def test_nothing_pops_on_a_walk_when_the_shadow_map_takes_over(shaded, engine):
     """What each sector shows goes over from baked visibility to the map's: no voxel moves by more than a share of the way in a tick."""
     world, may_read = shaded
@@ -615,13 +647,11 @@ def test_nothing_pops_on_a_walk_when_the_shadow_map_takes_over(shaded, engine):
         time.sleep(0.002)
     assert sampled(world)
     assert len({frame.first_voxel[0] for frame in frames}) > 10
-    whole_way = max(
-        np.abs(run.settle(at(place), light_of(world, lighting)) - engine.volume(place, lighting).values).max()
-        for place in (places[0], places[-1])
-    )
+    whole_way = max(way_to_query(run, light_of(world, lighting), place, engine) for place in (places[0], places[-1]))
     largest = max(largest_step(before, after) for before, after in pairwise(frames))
     # A step of the fade, and what the light itself still moves by while it settles.
-    assert 0.5 * whole_way / FADE_TICKS <= largest <= 1.5 * whole_way / FADE_TICKS
+    assert whole_way > 2 * FADE_STEP
+    assert 0.5 * FADE_STEP <= largest <= 1.5 * max(FADE_STEP, whole_way / FADE_TICKS)
 
 
 def test_nothing_pops_when_samples_grow_too_old(shaded, engine, monkeypatch):
@@ -629,7 +659,7 @@ def test_nothing_pops_when_samples_grow_too_old(shaded, engine, monkeypatch):
     may_read.set()
     run, lighting = Run(world), engine.lighting("2024-06-21T15:00:00", "clear")
     run.until(at(STREET), light_of(world, lighting), lambda r: sampled(world))
-    whole_way = np.abs(run.settle(at(STREET), light_of(world, lighting)) - engine.volume(STREET, lighting).values).max()
+    whole_way = way_to_query(run, light_of(world, lighting), STREET, engine)
     monkeypatch.setattr(world._shadows, "_plan", lambda *_: None)  # as if other players took all of its time
     steps = {True: [], False: []}
     frame = world.volumes.of_player["p0"].published
@@ -640,7 +670,7 @@ def test_nothing_pops_when_samples_grow_too_old(shaded, engine, monkeypatch):
         steps[sampled(world)].append(largest_step(last, frame))
     assert unbound(world)
     assert len(steps[True]) > 10 < len(steps[False])
-    assert max(steps[False]) <= 1.5 * max(steps[True]) + 1.5 * whole_way / FADE_TICKS
+    assert max(steps[False]) <= 1.5 * max(steps[True]) + 1.5 * max(FADE_STEP, whole_way / FADE_TICKS)
 
 
 def test_a_clock_that_jumps_leaves_no_old_samples_bound(shaded, engine):
