@@ -152,14 +152,18 @@ def oldest_fresh(drawn_for: Sequence[Float64], to_sun: Float64) -> int:
 
 def box_corners(boxes: Sequence[MovingBox]) -> Float64:
     """The corners of boxes: (b, 8, 3) float64 [m], world frame, in the order of _CORNER_SIDES."""
+    half_size = np.array([box.half_size for box in boxes]).reshape(-1, 1, 3)
+    position = np.array([box.position for box in boxes]).reshape(-1, 1, 3)
+    return np.asarray(position + (_CORNER_SIDES * half_size) @ box_axes(boxes))
+
+
+def box_axes(boxes: Sequence[MovingBox]) -> Float64:
+    """Unit vectors along each box's own x, y and z: (b, 3, 3) float64, world frame."""
     turn = np.radians([box.turned_degrees for box in boxes])
     level = np.zeros_like(turn)
     ahead = np.stack([np.cos(turn), level, -np.sin(turn)], axis=1)
     side = np.stack([np.sin(turn), level, np.cos(turn)], axis=1)
-    axes = np.stack([ahead, np.broadcast_to([0.0, 1.0, 0.0], ahead.shape), side], axis=1)  # (b, 3, 3): of each its x, y, z
-    half_size = np.array([box.half_size for box in boxes]).reshape(-1, 1, 3)
-    position = np.array([box.position for box in boxes]).reshape(-1, 1, 3)
-    return np.asarray(position + (_CORNER_SIDES * half_size) @ axes)
+    return np.stack([ahead, np.broadcast_to([0.0, 1.0, 0.0], ahead.shape), side], axis=1)
 
 
 def box_triangles(corners: Float64) -> Float64:

@@ -102,6 +102,15 @@ class VolumeQuery(PositionQuery, VolumeFormatQuery):
 
 class PlayerVolumeQuery(VolumeFormatQuery):
     since: int | None = Field(None, ge=-1, le=LARGEST_INTEGER, description="the tick that the client has: 304 when there is no later one")
+    stale: bool = Field(
+        False, description="1: of each voxel's light the share (uint8, 255: all) that comes from probes which moving boxes hide from it"
+    )
+
+    @model_validator(mode="after")
+    def _one_kind_of_bytes(self) -> "PlayerVolumeQuery":
+        if self.stale and (self.mask or self.since is not None):
+            raise ValueError("stale: expected without mask and since: it is worked out anew each time")
+        return self
 
 
 class LiveQuery(StrictQuery):

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import numpy as np
 from fastapi import APIRouter, Query, Request, Response
 
-from gi_core.arrays import AnyArray, Float32
+from gi_core.arrays import AnyArray, Float32, UInt8
 from gi_core.basis import average
 from gi_core.constants import CUBE_FACES
 from gi_core.errors import InputError
@@ -107,14 +107,19 @@ def light_body(found: Volume, query: VolumeFormatQuery, rooms: tuple[Room, ...] 
 
 def mask_body(found: Volume, query: VolumeFormatQuery, rooms: tuple[Room, ...] = ()) -> Body:
     """The classes of a volume's voxels."""
-    classes = np.swapaxes(found.mask, 0, 1) if query.format == "ktx2" else found.mask
-    described = volume_facts(found, classes.shape, "uint8", 1.0, rooms)
+    return bytes_body(found, found.mask, query, {}, rooms)
+
+
+def bytes_body(found: Volume, values: UInt8, query: VolumeFormatQuery, facts: Mapping[str, Any], rooms: tuple[Room, ...] = ()) -> Body:
+    """A byte for each voxel (y, z, x), and facts that are other than those of a volume's classes."""
+    texels = np.swapaxes(values, 0, 1) if query.format == "ktx2" else values
+    described = {**volume_facts(found, texels.shape, "uint8", 1.0, rooms), **facts}
     if query.format == "npy":
-        content = npy(classes)
+        content = npy(texels)
     else:
-        content = classes.tobytes()
+        content = texels.tobytes()
         if query.format == "ktx2":
-            content = _file(content, classes.shape, ktx2.BYTE, described)
+            content = _file(content, texels.shape, ktx2.BYTE, described)
     return _body(content, query, described)
 
 

@@ -1,11 +1,13 @@
 """A player's latest volume: the same layout as a query's, asked for again only when there is a later one."""
 
+import io
 import json
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 
 import httpx
+import numpy as np
 import pytest
 
 PATIENCE_S = 20.0
@@ -106,3 +108,29 @@ def test_every_reply_tells_its_total(live_http: httpx.Client, settled: str) -> N
         live_http.post("/v1/players", json={"id": settled}),
     ):
         assert timing(reply)["total"] > 0, reply.request
+
+
+def test_voxels_that_a_box_belies_are_told(live_http: httpx.Client, settled: str, street: tuple[float, float, float]) -> None:
+    path = f"/v1/players/{settled}/volume"
+    assert "gi-boxes" not in live_http.get(path).headers
+    free = live_http.get(path, params={"stale": 1})
+    facts = json.loads(free.headers["gi-volume"])
+    assert (facts["unit"], facts["dtype"], facts["boxes"], facts["shape"]) == ("share", "uint8", 0, [16, 32, 32])
+    assert not read_npy(free).any()
+    live_http.post("/v1/boxes", json={"id": "bus", "position": list(street), "half_size": [6, 2, 6]})
+    try:
+        assert live_http.get(path).headers["gi-boxes"] == "1"
+        share = read_npy(live_http.get(path, params={"stale": 1}))
+        assert share[8, 16, 16] == 255  # in the bus
+        assert 0 < np.count_nonzero(share) < share.size
+        raw = live_http.get(path, params={"stale": 1, "format": "raw"})
+        assert (raw.content, raw.headers["cache-control"]) == (share.tobytes(), "no-store")
+        refused = live_http.get(path, params={"stale": 1, "mask": 1})
+        assert (refused.status_code, refused.headers["content-type"]) == (400, "application/problem+json")
+    finally:
+        live_http.delete("/v1/boxes/bus")
+    assert "gi-boxes" not in live_http.get(path).headers
+
+
+def read_npy(reply: httpx.Response) -> np.ndarray:
+    return np.load(io.BytesIO(reply.content))
