@@ -18,7 +18,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from rich.console import Console
@@ -45,6 +45,7 @@ from gi_core.dataset import (
     sector_path,
     write_world,
 )
+from gi_core.distant_transfer import DistantTransfer
 from gi_core.errors import FormatError, InputError, SectorlightError
 from gi_core.grid import SectorIndex
 from gi_core.json_fields import LARGEST_INTEGER
@@ -54,6 +55,7 @@ from gi_core.sun_table import SunTable
 # Part of the bake id: raised whenever the same settings would give other bytes than before.
 BAKER_VERSION = 4
 SectorRange = tuple[tuple[int, int], tuple[int, int]]
+_Done = TypeVar("_Done")
 
 
 class WorkerLostError(SectorlightError, RuntimeError):
@@ -86,6 +88,8 @@ class _Finished:
     facts: SectorFacts
     distant_sky: list[float]
     seconds: float
+    transfer: DistantTransfer | None = None
+    """None where an earlier run baked the sector."""
 
 
 def bake(
@@ -130,6 +134,7 @@ def bake(
             _clear(output)
     done = {i: f for i in wanted if (f := _finished(output, i, bake_id, settings.voxel_levels > 1)) is not None}
     remaining = [i for i in wanted if i not in done]
+    transfers = _known_transfers(output, bake_id)
     if done:
         console.print(f"{len(done)} of {len(wanted)} sectors are finished already; baking the other {len(remaining)}")
     report = _report_of(output, bake_id, wanted)
@@ -149,18 +154,28 @@ def bake(
             console=console,
         ) as progress:
             task = progress.add_task("bake", total=len(wanted), completed=len(done), preset=settings.preset)
-            for finished in _run(scene, settings, table, bake_id, output, remaining, workers):
+            for finished in _run(_bake_one, scene, settings, table, bake_id, output, remaining, workers):
                 done[finished.index] = finished
+                if finished.transfer is not None:
+                    transfers[finished.index] = finished.transfer
                 if on_baked is not None:
                     on_baked(finished.seconds)
                 progress.advance(task)
     wall_seconds = time.perf_counter() - started
+    # Of sectors that an earlier run finished; the file that kept their transfers comes last.
+    lacking = [i for i in wanted if i not in transfers]
+    if lacking:
+        console.print(f"distant texels of {len(lacking)} finished sectors")
+        processes = min(jobs or os.cpu_count() or 1, len(lacking))
+        transfers |= dict(_run(_find_transfer, scene, settings, table, bake_id, output, lacking, processes))
 
     def read(index: SectorIndex) -> Sector:
         return sector_file.read(sector_path(output, index))[0]
 
     expect_sense({i: done[i].facts for i in wanted}, read, settings.sky_sources)
-    texels = distant_file.assemble({i: f.distant_sky for i, f in done.items()})
+    texels = distant_file.assemble({i: done[i].distant_sky for i in wanted}, transfers)
+    if texels.transfer is None:
+        console.print("The distant texture knows the sky alone: what suns send to so many sectors is more than its file may hold.")
     world = WorldInfo(
         name=scene.name,
         source=Path(source).name if Path(source).exists() else source,
@@ -182,9 +197,10 @@ def bake(
         decals=scene.decals,
     )
     with _writing(output):
-        write_atomic(output / DISTANT_FILE, distant_file.encode(texels, bake_id))
+        distant = distant_file.encode(texels, bake_id)
+        write_atomic(output / DISTANT_FILE, distant)
         write_world(output, world)
-    print_summary(console, world, sum(f.seconds for f in done.values()), wall_seconds, len(remaining), workers)
+    print_summary(console, world, len(distant), sum(f.seconds for f in done.values()), wall_seconds, len(remaining), workers)
     return world
 
 
@@ -220,6 +236,15 @@ def _clear(output: Path) -> None:
         shutil.rmtree(output / name, ignore_errors=True)
     for name in (WORLD_FILE, DISTANT_FILE):
         (output / name).unlink(missing_ok=True)
+
+
+def _known_transfers(output: Path, bake_id: str) -> dict[SectorIndex, DistantTransfer]:
+    """What an earlier run of this very bake left in its distant file."""
+    try:
+        texels, found = distant_file.read(output / DISTANT_FILE)
+    except (OSError, FormatError):
+        return {}
+    return distant_file.taken_apart(texels) if found == bake_id else {}
 
 
 def _report_of(output: Path, bake_id: str, wanted: list[SectorIndex]) -> dict[str, Any] | None:
@@ -303,13 +328,25 @@ def _bake_one(index: SectorIndex) -> _Finished:
         write_atomic(sector_path(_output, index), baked.sector_bytes)
     fine_bytes = None if baked.fine_bytes is None else len(baked.fine_bytes)
     facts = _facts(baked.sector_bytes, len(baked.geometry_bytes), fine_bytes, baked.meta)
-    return _Finished(index, facts, baked.meta["distant_sky"], time.process_time() - started)
+    return _Finished(index, facts, baked.meta["distant_sky"], time.process_time() - started, baked.transfer)
+
+
+def _find_transfer(index: SectorIndex) -> tuple[SectorIndex, DistantTransfer]:
+    assert _baker is not None
+    return index, _baker.transfers.transfer(sector_file.read(sector_path(_output, index))[0])
 
 
 def _run(
-    scene: Scene, settings: BakeSettings, table: SunTable, bake_id: str, output: Path, remaining: list[SectorIndex], workers: int
-) -> Iterator[_Finished]:
-    """Bake sectors in worker processes, in whatever order they finish."""
+    job: Callable[[SectorIndex], _Done],
+    scene: Scene,
+    settings: BakeSettings,
+    table: SunTable,
+    bake_id: str,
+    output: Path,
+    remaining: list[SectorIndex],
+    workers: int,
+) -> Iterator[_Done]:
+    """Do a worker's job for each of some sectors, in whatever order they finish."""
     names = ("vertices", "triangles", "albedo", "emission")
     empty = Scene(**{**scene.__dict__, **{n: getattr(scene, n)[:0] for n in names}})
     with tempfile.TemporaryDirectory(prefix="sectorlight-") as folder:
@@ -324,12 +361,12 @@ def _run(
             initargs=(arrays_path, empty, settings, table, bake_id, output),
         )
         queue = iter(remaining)
-        pending: set[Future[_Finished]] = set()
+        pending: set[Future[_Done]] = set()
         try:
             # A few tasks ahead of the workers, so that an interrupt has little to wait for.
             for index in queue:
                 with _interrupts_held():
-                    pending.add(pool.submit(_bake_one, index))
+                    pending.add(pool.submit(job, index))
                 if len(pending) < 2 * workers:
                     continue
                 finished, pending = wait(pending, return_when=FIRST_COMPLETED)
