@@ -69,13 +69,14 @@ class TransferBaker:
         chosen = of_texel(sector.probe_room, sector.probe_flags)
         if chosen.any():
             factors, wanted = _factors(sector, self._sky_patches), _texel_weights(sector, chosen)
+            sunlit = _sunlit(sector, self._sun_directions)
             shine = [self._lamplight(sector, schedule) for schedule in self.schedules]
             for cover in range(COVERS):
                 albedo = snowed_albedo(sector, float(cover))
                 of_bricks, sky[cover] = _carried_back(sector, factors, wanted, albedo)
                 of_surfels = _of_surfels(sector, of_bricks)
                 reflected = of_surfels * albedo[:, None, :]
-                sun[cover] = _sun_transfer(sector, reflected, self._sun_directions)
+                sun[cover] = _sun_transfer(sector, reflected, sunlit, self._sun_directions)
                 for number, schedule in enumerate(self.schedules):
                     glow[cover, number] = np.einsum("sfc,sc->fc", reflected, shine[number])
                     if schedule == "always" and sector.surfel_emission is not None:
@@ -176,13 +177,19 @@ def _carried_back(sector: Sector, factors: Any, wanted: Float32, albedo: Float32
     return found[: sector.brick_count], found[sector.brick_count :]
 
 
-def _sun_transfer(sector: Sector, reflected: Float32, sun_directions: Float64) -> Float32:
+def _sunlit(sector: Sector, sun_directions: Float64) -> Any:
+    """(D, S) sparse, 1 where a surfel sees a sun and faces it."""
+    suns = sun_directions.astype(np.float32)
+    lit = [np.flatnonzero((sun_bits(sector, d) > 0) & (sector.surfel_normal @ sun > 0)) for d, sun in enumerate(suns)]
+    column = np.concatenate([np.zeros(0, np.int64), *lit])
+    starts = np.cumsum([0, *map(len, lit)])
+    return csr_array((np.ones(len(column), np.float32), column, starts), shape=(len(suns), sector.surfel_count))
+
+
+def _sun_transfer(sector: Sector, reflected: Float32, sunlit: Any, sun_directions: Float64) -> Float32:
     """(D, 2, 6, 3): what the texel gets of each sun, from what it gets per irradiance of each surfel (S, 6, 3)."""
     # A surfel's cosine is linear in the sun's direction: along each axis by itself.
-    by_axis = (sector.surfel_normal[:, :, None] * reflected.reshape(-1, 1, FACES * CHANNELS)).reshape(-1, 3 * FACES * CHANNELS)
-    found = np.zeros((len(sun_directions), SUN_PARTS, FACES, CHANNELS), np.float32)
-    for plane, (east, _, south) in enumerate(sun_directions.astype(np.float32)):
-        lit = (sun_bits(sector, plane) > 0) & (sector.surfel_normal @ sun_directions[plane].astype(np.float32) > 0)
-        x, y, z = by_axis[lit].sum(axis=0).reshape(3, FACES, CHANNELS)
-        found[plane] = y, east * x + south * z
-    return found
+    by_axis = sector.surfel_normal[:, :, None] * reflected.reshape(-1, 1, FACES * CHANNELS)
+    x, y, z = np.moveaxis((sunlit @ by_axis.reshape(len(by_axis), -1)).reshape(-1, 3, FACES, CHANNELS), 1, 0)
+    east, south = (sun_directions[:, axis, None, None].astype(np.float32) for axis in (0, 2))
+    return np.stack([y, east * x + south * z], axis=1)
