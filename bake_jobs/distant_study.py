@@ -1,6 +1,7 @@
 """How wrong is a distant texel? Both its lights beside the path tracer's mean over the very points that it stands for.
 
     python -m bake_jobs.distant_study SOURCE DATASET X,Z [X,Z ...]     a table on stdout
+    python -m bake_jobs.distant_study SOURCE DATASET time              what they take: time, bytes
 
 DATASET is a bake of SOURCE that has at least these sectors. ``relit``: the mean of the same probes, lit as for a volume: what of an error
 is the bake's own, and what comes of blending suns and snow.
@@ -8,15 +9,18 @@ is the bake's own, and what comes of blending suns and snow.
 
 import re
 import sys
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from bake_jobs.compare_report import StageSamples, summarise
 from bake_jobs.compare_states import DEFAULT_STATES, parse_states
-from bake_jobs.distant_transfer import of_texel
+from bake_jobs.distant_transfer import TransferBaker, of_texel
 from bake_jobs.path_tracer import Estimate, PathTracer
+from bake_jobs.scene import Scene
 from bake_jobs.scene_source import load_scene
 from gi_core.arrays import Float32
 from gi_core.basis import convert
@@ -30,6 +34,7 @@ from gi_core.lights import lamps_on
 # Of each of some hundred probes.
 SAMPLES = 512
 STAGES = ("sky", "full", "relit")
+REPEATS, TIMED_SECTORS = 51, 20
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -39,8 +44,39 @@ def main(arguments: Sequence[str]) -> None:
             scene, engine = load_scene(source), Engine(Dataset.open(path))
             tracer = PathTracer(scene.vertices, scene.triangles, scene.albedo, scene.emission)
             print_table(tracer, engine, [SectorIndex(*map(int, text.split(","))) for text in sectors])
+        case [source, path, "time"]:
+            print_costs(load_scene(source), Engine(Dataset.open(path)))
         case _:
             raise SystemExit(__doc__)
+
+
+def print_costs(scene: Scene, engine: Engine) -> None:
+    """Processor's microseconds to light the whole texture, medians of REPEATS; bytes; its seconds for a sector's transfer, mean of some."""
+    dataset = engine.dataset
+    world, transfer = dataset.world, dataset.distant().transfer
+    for state in parse_states(DEFAULT_STATES, world.location):
+        lighting = engine.lighting(state.time, state.weather)
+        spent = {light: _median_us(partial(engine.distant, lighting, light)) for light in dataset.distant().lights}
+        lights = len(lighting.directional_lights)
+        print(f"{state.name}, {lights} of sun and moon: {', '.join(f'{light} {us:.0f} us' for light, us in spent.items())}")
+    texels, held = len(world.sectors), 0 if transfer is None else transfer.nbytes
+    print(f"{texels} texels: {dataset.distant_bytes:,} bytes in the file, {held:,} in memory; {held / texels:,.0f} a texel")
+    baker = TransferBaker(scene, world.sun_table.directions, world.sky_patches)
+    some = [dataset.sector(index) for index in sorted(world.sectors)[:: max(1, texels // TIMED_SECTORS)]]
+    started = time.process_time()
+    for sector in some:
+        baker.transfer(sector)
+    print(f"bake: {(time.process_time() - started) / len(some):.2f} s a sector, {len(some)} sectors")
+
+
+def _median_us(call: Callable[[], object]) -> float:
+    spent = []
+    for _ in range(REPEATS):
+        # Of the thread, which does all of it: a busy machine adds nothing.
+        started = time.thread_time()
+        call()
+        spent.append(time.thread_time() - started)
+    return float(np.median(spent)) * 1e6
 
 
 def print_table(tracer: PathTracer, engine: Engine, sectors: Sequence[SectorIndex], samples: int = SAMPLES) -> None:
