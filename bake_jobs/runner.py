@@ -16,9 +16,9 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -55,7 +55,6 @@ from gi_core.sun_table import SunTable
 # Part of the bake id: raised whenever the same settings would give other bytes than before.
 BAKER_VERSION = 4
 SectorRange = tuple[tuple[int, int], tuple[int, int]]
-_Done = TypeVar("_Done")
 
 
 class WorkerLostError(SectorlightError, RuntimeError):
@@ -89,7 +88,7 @@ class _Finished:
     distant_sky: list[float]
     seconds: float
     transfer: DistantTransfer | None = None
-    """None where an earlier run baked the sector."""
+    """None where an earlier run baked the sector and left none."""
 
 
 def bake(
@@ -134,13 +133,18 @@ def bake(
             _clear(output)
     done = {i: f for i in wanted if (f := _finished(output, i, bake_id, settings.voxel_levels > 1)) is not None}
     remaining = [i for i in wanted if i not in done]
-    transfers = _known_transfers(output, bake_id)
+    known = _known_transfers(output, bake_id)
+    done = {i: replace(finished, transfer=known.get(i)) for i, finished in done.items()}
+    lacking = [i for i, finished in done.items() if finished.transfer is None]
     if done:
         console.print(f"{len(done)} of {len(wanted)} sectors are finished already; baking the other {len(remaining)}")
+    if lacking:
+        console.print(f"finding the distant light of {len(lacking)} finished sectors, which they do not hold themselves")
     report = _report_of(output, bake_id, wanted)
-    workers = max(1, min(jobs or os.cpu_count() or 1, len(remaining)))
+    tasks = [*((i, None) for i in remaining), *((i, done[i]) for i in lacking)]
+    workers = max(1, min(jobs or os.cpu_count() or 1, len(tasks)))
     started = time.perf_counter()
-    if remaining:
+    if tasks:
         # A world.json names a complete bake; while this one runs there is none.
         with _writing(output):
             (output / WORLD_FILE).unlink(missing_ok=True)
@@ -153,26 +157,20 @@ def bake(
             TimeRemainingColumn(),
             console=console,
         ) as progress:
-            task = progress.add_task("bake", total=len(wanted), completed=len(done), preset=settings.preset)
-            for finished in _run(_bake_one, scene, settings, table, bake_id, output, remaining, workers):
+            task = progress.add_task("bake", total=len(wanted), completed=len(wanted) - len(tasks), preset=settings.preset)
+            for finished in _run(scene, settings, table, bake_id, output, tasks, workers):
+                is_new = finished.index not in done
                 done[finished.index] = finished
-                if finished.transfer is not None:
-                    transfers[finished.index] = finished.transfer
-                if on_baked is not None:
+                if is_new and on_baked is not None:
                     on_baked(finished.seconds)
                 progress.advance(task)
     wall_seconds = time.perf_counter() - started
-    # Of sectors that an earlier run finished; the file that kept their transfers comes last.
-    lacking = [i for i in wanted if i not in transfers]
-    if lacking:
-        console.print(f"distant texels of {len(lacking)} finished sectors")
-        processes = min(jobs or os.cpu_count() or 1, len(lacking))
-        transfers |= dict(_run(_find_transfer, scene, settings, table, bake_id, output, lacking, processes))
 
     def read(index: SectorIndex) -> Sector:
         return sector_file.read(sector_path(output, index))[0]
 
     expect_sense({i: done[i].facts for i in wanted}, read, settings.sky_sources)
+    transfers = {i: found for i in wanted if (found := done[i].transfer) is not None}
     texels = distant_file.assemble({i: done[i].distant_sky for i in wanted}, transfers)
     if texels.transfer is None:
         console.print("The distant texture knows the sky alone: what suns send to so many sectors is more than its file may hold.")
@@ -316,8 +314,11 @@ def _interrupts_held() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _bake_one(index: SectorIndex) -> _Finished:
+def _finish(index: SectorIndex, baked_earlier: _Finished | None) -> _Finished:
+    """Bake a sector, or find what an earlier run's lacks."""
     assert _baker is not None
+    if baked_earlier is not None:
+        return replace(baked_earlier, transfer=_baker.transfers.transfer(sector_file.read(sector_path(_output, index))[0]))
     started = time.process_time()
     baked = _baker.bake(index)
     with _writing(_output):
@@ -331,22 +332,16 @@ def _bake_one(index: SectorIndex) -> _Finished:
     return _Finished(index, facts, baked.meta["distant_sky"], time.process_time() - started, baked.transfer)
 
 
-def _find_transfer(index: SectorIndex) -> tuple[SectorIndex, DistantTransfer]:
-    assert _baker is not None
-    return index, _baker.transfers.transfer(sector_file.read(sector_path(_output, index))[0])
-
-
 def _run(
-    job: Callable[[SectorIndex], _Done],
     scene: Scene,
     settings: BakeSettings,
     table: SunTable,
     bake_id: str,
     output: Path,
-    remaining: list[SectorIndex],
+    tasks: Sequence[tuple[SectorIndex, _Finished | None]],
     workers: int,
-) -> Iterator[_Done]:
-    """Do a worker's job for each of some sectors, in whatever order they finish."""
+) -> Iterator[_Finished]:
+    """Finish sectors in worker processes, in whatever order they come."""
     names = ("vertices", "triangles", "albedo", "emission")
     empty = Scene(**{**scene.__dict__, **{n: getattr(scene, n)[:0] for n in names}})
     with tempfile.TemporaryDirectory(prefix="sectorlight-") as folder:
@@ -360,13 +355,13 @@ def _run(
             initializer=_start_worker,
             initargs=(arrays_path, empty, settings, table, bake_id, output),
         )
-        queue = iter(remaining)
-        pending: set[Future[_Done]] = set()
+        queue = iter(tasks)
+        pending: set[Future[_Finished]] = set()
         try:
             # A few tasks ahead of the workers, so that an interrupt has little to wait for.
-            for index in queue:
+            for task in queue:
                 with _interrupts_held():
-                    pending.add(pool.submit(job, index))
+                    pending.add(pool.submit(_finish, *task))
                 if len(pending) < 2 * workers:
                     continue
                 finished, pending = wait(pending, return_when=FIRST_COMPLETED)
