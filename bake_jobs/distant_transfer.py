@@ -24,7 +24,7 @@ from gi_core.arrays import AnyArray, Bool, Float32, Float64, Int64
 from gi_core.basis import FEEDBACK, basis_of_size, conversion, feedback_weights
 from gi_core.constants import BASIS_SIZES, ROOM_OUTDOORS
 from gi_core.distant_file import MAX_SCHEDULES
-from gi_core.distant_transfer import COVERS, SUN_PARTS, DistantTransfer
+from gi_core.distant_transfer import CHANNELS, COVERS, SUN_PARTS, DistantTransfer
 from gi_core.layout import SHADOW_END_M, SHADOW_START_M
 from gi_core.lights import light_records
 from gi_core.lights_twin import ray_targets, reaches, surfel_places, unshadowed, visible_share
@@ -35,7 +35,7 @@ from gi_core.world import Lamp
 # What bounces that were left out could still add, as a share; half floats round by 5e-4.
 RESIDUAL = 1e-4
 MAX_PASSES = 512
-FACES, CHANNELS = 6, 3
+FACES = 6
 
 
 def of_texel(room: AnyArray, flags: AnyArray) -> Bool:
@@ -81,7 +81,9 @@ class TransferBaker:
                     glow[cover, number] = np.einsum("sfc,sc->fc", reflected, shine[number])
                     if schedule == "always" and sector.surfel_emission is not None:
                         glow[cover, number] += np.einsum("sfc,sc->fc", of_surfels, np.float32(np.pi) * sector.surfel_emission)
-        return DistantTransfer(sky[:, :, None].astype(np.float16), sun[:, :, :, None].astype(np.float16), glow[:, :, None], self.schedules)
+        # Channels, then the one texel, then faces.
+        sky, sun, glow = (np.moveaxis(found, -1, -2)[..., None, :] for found in (sky, sun, glow))
+        return DistantTransfer(sky.astype(np.float16).astype(np.float32), sun.astype(np.float16), glow, self.schedules)
 
     def _lamplight(self, sector: Sector, schedule: str) -> Float32:
         """(S, 3) [lx] on surfels, of all lamps of a schedule."""
@@ -190,6 +192,6 @@ def _sun_transfer(sector: Sector, reflected: Float32, sunlit: Any, sun_direction
     """(D, 2, 6, 3): what the texel gets of each sun, from what it gets per irradiance of each surfel (S, 6, 3)."""
     # A surfel's cosine is linear in the sun's direction: along each axis by itself.
     by_axis = sector.surfel_normal[:, :, None] * reflected.reshape(-1, 1, FACES * CHANNELS)
-    x, y, z = np.moveaxis((sunlit @ by_axis.reshape(len(by_axis), -1)).reshape(-1, 3, FACES, CHANNELS), 1, 0)
+    x, y, z = np.moveaxis((sunlit @ by_axis.reshape(-1, 3 * FACES * CHANNELS)).reshape(-1, 3, FACES, CHANNELS), 1, 0)
     east, south = (sun_directions[:, axis, None, None].astype(np.float32) for axis in (0, 2))
     return np.stack([y, east * x + south * z], axis=1)

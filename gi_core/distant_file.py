@@ -10,7 +10,7 @@ import numpy as np
 from gi_core import container
 from gi_core.arrays import AnyArray, Float32, UInt8
 from gi_core.constants import MAX_SKY_PATCHES
-from gi_core.distant_transfer import COVERS, SUN_PARTS, DistantTransfer
+from gi_core.distant_transfer import CHANNELS, COVERS, SUN_PARTS, DistantTransfer
 from gi_core.errors import CorruptFileError
 from gi_core.grid import SectorIndex
 from gi_core.lights import is_schedule
@@ -72,9 +72,9 @@ def assemble(texels: Mapping[SectorIndex, list[float]], transfers: Mapping[Secto
     return replace(
         found,
         transfer=DistantTransfer(
-            sky=np.concatenate([part.sky for part in parts], axis=2),
-            sun=np.concatenate([part.sun for part in parts], axis=3),
-            glow=np.concatenate([part.glow for part in parts], axis=2),
+            sky=np.concatenate([part.sky for part in parts], axis=-2),
+            sun=np.concatenate([part.sun for part in parts], axis=-2),
+            glow=np.concatenate([part.glow for part in parts], axis=-2),
             schedules=parts[0].schedules,
         ),
     )
@@ -85,9 +85,10 @@ def taken_apart(texels: DistantTexels) -> dict[SectorIndex, DistantTransfer]:
     whole = texels.transfer
     if whole is None:
         return {}
+    only = [slice(i, i + 1) for i in range(whole.texels)]
     return {
-        index: DistantTransfer(whole.sky[:, :, i : i + 1], whole.sun[:, :, :, i : i + 1], whole.glow[:, :, i : i + 1], whole.schedules)
-        for i, index in enumerate(texels.sectors())
+        index: DistantTransfer(whole.sky[..., one, :], whole.sun[..., one, :], whole.glow[..., one, :], whole.schedules)
+        for index, one in zip(texels.sectors(), only, strict=True)
     }
 
 
@@ -99,7 +100,7 @@ def encode(texels: DistantTexels, bake_id: str) -> bytes:
     if transfer is None:
         return container.encode(KIND, SKY_VERSION, meta, arrays)
     meta["schedules"] = list(transfer.schedules)
-    arrays |= {"sky_transfer": transfer.sky, "sun_transfer": transfer.sun, "glow": transfer.glow}
+    arrays |= {"sky_transfer": transfer.sky.astype(np.float16), "sun_transfer": transfer.sun, "glow": transfer.glow}
     return container.encode(KIND, VERSION, meta, arrays)
 
 
@@ -141,13 +142,14 @@ def _transfer(found: container.Container, texels: int) -> DistantTransfer:
             f"found {patches}, {planes} and {len(given)}"
         )
     expected = {
-        "sky_transfer": (sky, (COVERS, patches, texels, 6, 3)),
-        "sun_transfer": (sun, (COVERS, planes, SUN_PARTS, texels, 6, 3)),
-        "glow": (glow, (COVERS, len(given), texels, 6, 3)),
+        "sky_transfer": (sky, (COVERS, patches, CHANNELS, texels, 6)),
+        "sun_transfer": (sun, (COVERS, planes, SUN_PARTS, CHANNELS, texels, 6)),
+        "glow": (glow, (COVERS, len(given), CHANNELS, texels, 6)),
     }
     for name, (values, shape) in expected.items():
         if values.shape != shape or not np.isfinite(values).all():
             raise CorruptFileError(f"expected {name} to be finite and of shape {shape}, found {values.shape}")
     if np.abs(glow).max(initial=0) > MAX_GLOW_LX:
         raise CorruptFileError(f"expected glow of at most {MAX_GLOW_LX:g} lx, found {np.abs(glow).max():g}")
-    return DistantTransfer(sky, sun, glow, tuple(given))
+    # Of the sky all is read at each relight: halves would have to be turned into floats each time, which takes longer than the sums.
+    return DistantTransfer(sky.astype(np.float32), sun, glow, tuple(given))

@@ -79,8 +79,8 @@ def test_contents_that_are_missing_are_refused_by_name(missing):
 def transfer(seed: int) -> DistantTransfer:
     """One texel's, of random numbers."""
     rng = np.random.default_rng(seed)
-    sky, sun, glow = rng.random((2, 8, 1, 6, 3)), rng.random((2, 5, 2, 1, 6, 3)), rng.random((2, 2, 1, 6, 3))
-    return DistantTransfer(sky.astype(np.float16), sun.astype(np.float16), glow.astype(np.float32), ("always", "night"))
+    sky, sun, glow = rng.random((2, 8, 3, 1, 6)), rng.random((2, 5, 2, 3, 1, 6)), rng.random((2, 2, 3, 1, 6))
+    return DistantTransfer(sky.astype(np.float16).astype(np.float32), sun.astype(np.float16), glow.astype(np.float32), ("always", "night"))
 
 
 def test_each_sector_has_its_own_transfer_whatever_the_order_of_baking():
@@ -117,27 +117,27 @@ def test_transfers_that_no_file_may_hold_are_left_out(monkeypatch):
 @pytest.mark.parametrize(
     ("meta", "arrays"),
     [
-        ({}, {"sky_transfer": np.zeros((2, 0, 4, 6, 3), np.float16)}),
-        ({}, {"sky_transfer": np.zeros((2, 1025, 4, 6, 3), np.float16)}),
-        ({}, {"sky_transfer": np.zeros((2, 8, 3, 6, 3), np.float16)}),
-        ({}, {"sky_transfer": np.zeros((1, 8, 4, 6, 3), np.float16)}),
-        ({}, {"sky_transfer": np.zeros((2, 8, 4, 6, 3), np.float32)}),
-        ({}, {"sky_transfer": np.full((2, 8, 4, 6, 3), np.inf, np.float16)}),
-        ({}, {"sun_transfer": np.full((2, 5, 2, 4, 6, 3), np.nan, np.float16)}),
-        ({}, {"sun_transfer": np.zeros((2, 0, 2, 4, 6, 3), np.float16)}),
-        ({}, {"sun_transfer": np.zeros((2, 5, 3, 4, 6, 3), np.float16)}),
-        ({}, {"sun_transfer": np.zeros((2, 5, 4, 6, 3), np.float16)}),
-        ({}, {"glow": np.zeros((2, 2, 4, 6, 3), np.float32)}),
-        ({}, {"glow": np.full((2, 1, 4, 6, 3), np.nan, np.float32)}),
-        ({}, {"glow": np.full((2, 1, 4, 6, 3), 2e30, np.float32)}),
+        ({}, {"sky_transfer": np.zeros((2, 0, 3, 4, 6), np.float16)}),
+        ({}, {"sky_transfer": np.zeros((2, 1025, 3, 4, 6), np.float16)}),
+        ({}, {"sky_transfer": np.zeros((2, 8, 3, 3, 6), np.float16)}),
+        ({}, {"sky_transfer": np.zeros((1, 8, 3, 4, 6), np.float16)}),
+        ({}, {"sky_transfer": np.zeros((2, 8, 3, 4, 6), np.float32)}),
+        ({}, {"sky_transfer": np.full((2, 8, 3, 4, 6), np.inf, np.float16)}),
+        ({}, {"sun_transfer": np.full((2, 5, 2, 3, 4, 6), np.nan, np.float16)}),
+        ({}, {"sun_transfer": np.zeros((2, 0, 2, 3, 4, 6), np.float16)}),
+        ({}, {"sun_transfer": np.zeros((2, 5, 3, 3, 4, 6), np.float16)}),
+        ({}, {"sun_transfer": np.zeros((2, 5, 3, 4, 6), np.float16)}),
+        ({}, {"glow": np.zeros((2, 2, 3, 4, 6), np.float32)}),
+        ({}, {"glow": np.full((2, 1, 3, 4, 6), np.nan, np.float32)}),
+        ({}, {"glow": np.full((2, 1, 3, 4, 6), 2e30, np.float32)}),
         ({"schedules": "night"}, {}),
         ({"schedules": ["at dusk"]}, {}),
         ({"schedules": [7]}, {}),
         ({"schedules": []}, {}),
-        ({"schedules": ["night", "night"]}, {"glow": np.zeros((2, 2, 4, 6, 3), np.float32)}),
+        ({"schedules": ["night", "night"]}, {"glow": np.zeros((2, 2, 3, 4, 6), np.float32)}),
         (
             {"schedules": [f"00:{minute:02}-12:00" for minute in range(60)] + [f"01:0{minute}-12:00" for minute in range(5)]},
-            {"glow": np.zeros((2, MAX_SCHEDULES + 1, 4, 6, 3), np.float32)},
+            {"glow": np.zeros((2, MAX_SCHEDULES + 1, 3, 4, 6), np.float32)},
         ),
         ({}, {"valid": np.array([[1, 1], [1, 0]], np.uint8)}),
     ],
@@ -146,9 +146,9 @@ def test_transfers_that_do_not_fit_are_refused_by_name(meta, arrays):
     whole = {
         "sky": np.zeros((2, 2, 6), np.float32),
         "valid": np.ones((2, 2), np.uint8),
-        "sky_transfer": np.zeros((2, 8, 4, 6, 3), np.float16),
-        "sun_transfer": np.zeros((2, 5, 2, 4, 6, 3), np.float16),
-        "glow": np.zeros((2, 1, 4, 6, 3), np.float32),
+        "sky_transfer": np.zeros((2, 8, 3, 4, 6), np.float16),
+        "sun_transfer": np.zeros((2, 5, 2, 3, 4, 6), np.float16),
+        "glow": np.zeros((2, 1, 3, 4, 6), np.float32),
     }
     about = {"origin": [0, 0], "bake_id": BAKE_ID, "schedules": ["night"]}
     assert distant_file.decode(container.encode(KIND, VERSION, about, whole), "good.gidist")[0].transfer is not None

@@ -32,7 +32,7 @@ GOLDEN = HERE / "v1"
 SECTORS = sorted(path for version in DIGESTS for path in (HERE / f"v{version}" / "sectors").iterdir())
 GEOMETRIES = sorted(path for version in DIGESTS for path in (HERE / f"v{version}" / "geometry").iterdir())
 DISTANT_V2 = HERE / "distant_v2" / "distant.gidist"
-DISTANT_V2_DIGEST = "0fe61f768d0c2d0a02ff70522c8994e5"
+DISTANT_V2_DIGEST = "8ff8db0362f7c783bcf00d4cdb5c4d1f"
 FINE = sorted((HERE / "v3" / "fine").iterdir())
 each_version = pytest.mark.parametrize("golden", [HERE / f"v{version}" for version in DIGESTS], ids=lambda path: path.name)
 
