@@ -19,7 +19,9 @@ def missed_target(world: WorldInfo) -> list[tuple[SectorIndex, float]]:
     return sorted(found, key=lambda pair: (-pair[1], pair[0]))
 
 
-def print_summary(console: Console, world: WorldInfo, core_seconds: float, wall_seconds: float, baked: int, workers: int) -> None:
+def print_summary(
+    console: Console, world: WorldInfo, distant_bytes: int, core_seconds: float, wall_seconds: float, baked: int, workers: int
+) -> None:
     """Print totals and means per sector. ``core_seconds`` is processor time over the ``baked`` sectors of this run."""
     counts = world.counts
     sectors = max(counts["sectors"], 1)
@@ -33,6 +35,7 @@ def print_summary(console: Console, world: WorldInfo, core_seconds: float, wall_
     if world.has_fine_voxels:
         fine = sum(facts.fine_bytes or 0 for facts in world.sectors.values())
         table.add_row("fine voxel files", f"{fine / 1e6:,.1f} MB", f"{fine / 1e3 / sectors:,.0f} kB")
+    table.add_row("distant texture", f"{distant_bytes / 1e6:,.1f} MB", f"{distant_bytes / 1e3 / sectors:,.1f} kB")
     if baked:
         table.add_row("core time", f"{core_seconds:,.1f} s", f"{core_seconds / baked:,.2f} s")
         table.add_row(f"time, {workers} processes", f"{wall_seconds:,.1f} s", f"{wall_seconds / baked:,.2f} s")
