@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +45,7 @@ from gi_core.dataset import (
     sector_path,
     write_world,
 )
+from gi_core.distant_transfer import DistantTransfer
 from gi_core.errors import FormatError, InputError, SectorlightError
 from gi_core.grid import SectorIndex
 from gi_core.json_fields import LARGEST_INTEGER
@@ -86,6 +87,8 @@ class _Finished:
     facts: SectorFacts
     distant_sky: list[float]
     seconds: float
+    transfer: DistantTransfer | None = None
+    """None where an earlier run baked the sector and left none."""
     own_error: float | None = None
     """What probes err by themselves; None where no target error asked."""
 
@@ -132,12 +135,18 @@ def bake(
             _clear(output)
     done = {i: f for i in wanted if (f := _finished(output, i, bake_id, settings.voxel_levels > 1)) is not None}
     remaining = [i for i in wanted if i not in done]
+    known = _known_transfers(output, bake_id)
+    done = {i: replace(finished, transfer=known.get(i)) for i, finished in done.items()}
+    lacking = [i for i, finished in done.items() if finished.transfer is None]
     if done:
         console.print(f"{len(done)} of {len(wanted)} sectors are finished already; baking the other {len(remaining)}")
+    if lacking:
+        console.print(f"finding the distant light of {len(lacking)} finished sectors, which they do not hold themselves")
     report = _report_of(output, bake_id, wanted)
-    workers = max(1, min(jobs or os.cpu_count() or 1, len(remaining)))
+    tasks = [*((i, None) for i in remaining), *((i, done[i]) for i in lacking)]
+    workers = max(1, min(jobs or os.cpu_count() or 1, len(tasks)))
     started = time.perf_counter()
-    if remaining:
+    if tasks:
         # A world.json names a complete bake; while this one runs there is none.
         with _writing(output):
             (output / WORLD_FILE).unlink(missing_ok=True)
@@ -150,10 +159,11 @@ def bake(
             TimeRemainingColumn(),
             console=console,
         ) as progress:
-            task = progress.add_task("bake", total=len(wanted), completed=len(done), preset=settings.preset)
-            for finished in _run(scene, settings, table, bake_id, output, remaining, workers):
+            task = progress.add_task("bake", total=len(wanted), completed=len(wanted) - len(tasks), preset=settings.preset)
+            for finished in _run(scene, settings, table, bake_id, output, tasks, workers):
+                is_new = finished.index not in done
                 done[finished.index] = finished
-                if on_baked is not None:
+                if is_new and on_baked is not None:
                     on_baked(finished.seconds)
                 progress.advance(task)
     wall_seconds = time.perf_counter() - started
@@ -162,7 +172,10 @@ def bake(
         return sector_file.read(sector_path(output, index))[0]
 
     expect_sense({i: done[i].facts for i in wanted}, read, settings.sky_sources)
-    texels = distant_file.assemble({i: f.distant_sky for i, f in done.items()})
+    transfers = {i: found for i in wanted if (found := done[i].transfer) is not None}
+    texels = distant_file.assemble({i: done[i].distant_sky for i in wanted}, transfers)
+    if texels.transfer is None:
+        console.print("The distant texture knows the sky alone: what suns send to so many sectors is more than its file may hold.")
     world = WorldInfo(
         name=scene.name,
         source=Path(source).name if Path(source).exists() else source,
@@ -184,9 +197,10 @@ def bake(
         decals=scene.decals,
     )
     with _writing(output):
-        write_atomic(output / DISTANT_FILE, distant_file.encode(texels, bake_id))
+        distant = distant_file.encode(texels, bake_id)
+        write_atomic(output / DISTANT_FILE, distant)
         write_world(output, world)
-    print_summary(console, world, sum(f.seconds for f in done.values()), wall_seconds, len(remaining), workers)
+    print_summary(console, world, len(distant), sum(f.seconds for f in done.values()), wall_seconds, len(remaining), workers)
     print_own_errors(console, world, {i: f.own_error for i, f in done.items() if f.own_error is not None})
     return world
 
@@ -225,6 +239,15 @@ def _clear(output: Path) -> None:
         (output / name).unlink(missing_ok=True)
 
 
+def _known_transfers(output: Path, bake_id: str) -> dict[SectorIndex, DistantTransfer]:
+    """What an earlier run of this very bake left in its distant file."""
+    try:
+        texels, found = distant_file.read(output / DISTANT_FILE)
+    except (OSError, FormatError):
+        return {}
+    return distant_file.taken_apart(texels) if found == bake_id else {}
+
+
 def _report_of(output: Path, bake_id: str, wanted: list[SectorIndex]) -> dict[str, Any] | None:
     """What ``compare`` measured of this very bake when it had these very sectors, or None."""
     try:
@@ -261,7 +284,9 @@ def _finished(output: Path, index: SectorIndex, bake_id: str, has_fine: bool) ->
         if any(other != (index, bake_id) for other in [(sector.index, meta["bake_id"]), *others]):
             return None
         fine_bytes = fine.stat().st_size if has_fine else None
-        return _Finished(index, _facts(data, geometry.stat().st_size, fine_bytes, meta), meta["distant_sky"], 0.0, meta.get("own_error"))
+        return _Finished(
+            index, _facts(data, geometry.stat().st_size, fine_bytes, meta), meta["distant_sky"], 0.0, own_error=meta.get("own_error")
+        )
     except (OSError, FormatError, KeyError, TypeError, ValueError):
         return None  # damaged: bake it again
 
@@ -294,8 +319,11 @@ def _interrupts_held() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _bake_one(index: SectorIndex) -> _Finished:
+def _finish(index: SectorIndex, baked_earlier: _Finished | None) -> _Finished:
+    """Bake a sector, or find what an earlier run's lacks."""
     assert _baker is not None
+    if baked_earlier is not None:
+        return replace(baked_earlier, transfer=_baker.transfers.transfer(sector_file.read(sector_path(_output, index))[0]))
     started = time.process_time()
     baked = _baker.bake(index)
     with _writing(_output):
@@ -306,13 +334,19 @@ def _bake_one(index: SectorIndex) -> _Finished:
         write_atomic(sector_path(_output, index), baked.sector_bytes)
     fine_bytes = None if baked.fine_bytes is None else len(baked.fine_bytes)
     facts = _facts(baked.sector_bytes, len(baked.geometry_bytes), fine_bytes, baked.meta)
-    return _Finished(index, facts, baked.meta["distant_sky"], time.process_time() - started, baked.meta.get("own_error"))
+    return _Finished(index, facts, baked.meta["distant_sky"], time.process_time() - started, baked.transfer, baked.meta.get("own_error"))
 
 
 def _run(
-    scene: Scene, settings: BakeSettings, table: SunTable, bake_id: str, output: Path, remaining: list[SectorIndex], workers: int
+    scene: Scene,
+    settings: BakeSettings,
+    table: SunTable,
+    bake_id: str,
+    output: Path,
+    tasks: Sequence[tuple[SectorIndex, _Finished | None]],
+    workers: int,
 ) -> Iterator[_Finished]:
-    """Bake sectors in worker processes, in whatever order they finish."""
+    """Finish sectors in worker processes, in whatever order they come."""
     names = ("vertices", "triangles", "albedo", "emission")
     empty = Scene(**{**scene.__dict__, **{n: getattr(scene, n)[:0] for n in names}})
     with tempfile.TemporaryDirectory(prefix="sectorlight-") as folder:
@@ -326,13 +360,13 @@ def _run(
             initializer=_start_worker,
             initargs=(arrays_path, empty, settings, table, bake_id, output),
         )
-        queue = iter(remaining)
+        queue = iter(tasks)
         pending: set[Future[_Finished]] = set()
         try:
             # A few tasks ahead of the workers, so that an interrupt has little to wait for.
-            for index in queue:
+            for task in queue:
                 with _interrupts_held():
-                    pending.add(pool.submit(_bake_one, index))
+                    pending.add(pool.submit(_finish, *task))
                 if len(pending) < 2 * workers:
                     continue
                 finished, pending = wait(pending, return_when=FIRST_COMPLETED)

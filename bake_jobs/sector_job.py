@@ -8,6 +8,7 @@ import numpy as np
 from bake_jobs import adaptive, factors, fine_voxels, gbuffer, placement, sun_visibility, surfels, voxels
 from bake_jobs.air import find_air
 from bake_jobs.config import BakeSettings
+from bake_jobs.distant_transfer import TransferBaker, of_texel
 from bake_jobs.geometry_clip import SectorCutter
 from bake_jobs.inside import Solids
 from bake_jobs.path_tracer import PathTracer
@@ -19,10 +20,11 @@ from bake_jobs.trial_light import TrialScene
 from bake_jobs.trial_states import trial_states
 from gi_core import factor_weights, fine_file, geometry_file, sector_file
 from gi_core.arrays import Float32, Float64
-from gi_core.constants import ALBEDO_MAX, ROOM_OUTDOORS
+from gi_core.constants import ALBEDO_MAX
+from gi_core.distant_transfer import DistantTransfer
 from gi_core.geometry_file import Geometry
 from gi_core.grid import SectorIndex
-from gi_core.sector import PROBE_IN_MARGIN, Sector
+from gi_core.sector import Sector
 from gi_core.sun_table import SunTable
 
 # What probes err by themselves changes a little with their number: it is measured so many times at most.
@@ -31,12 +33,16 @@ BAKES_FOR_TARGET = 3
 
 @dataclass(frozen=True, eq=False)
 class BakedSector:
-    """A sector's files and what the summary says of it; ``fine_bytes`` is None where no fine voxels were asked for."""
+    """A sector's files, its part of the distant file, and what the summary says of it.
+
+    fine_bytes : None where no fine voxels were asked for
+    """
 
     index: SectorIndex
     sector_bytes: bytes
     geometry_bytes: bytes
     fine_bytes: bytes | None
+    transfer: DistantTransfer
     meta: dict[str, Any]
 
 
@@ -53,6 +59,7 @@ class SectorBaker:
         self.rays = RayScene(scene.vertices, scene.triangles)
         self._solids = Solids(scene.vertices, scene.triangles)
         self.cutter = SectorCutter(scene)
+        self.transfers = TransferBaker(scene, sun_directions, settings.sky_sources, self.rays)
         self._pattern = gbuffer.cube_map_pattern(settings.rays_per_face_edge, settings.basis)
         self.trial = self._trial_scene() if settings.placement == "adaptive" or settings.voxel_weights == "fitted" else None
         self._served_error = self._judge() if settings.target_error and settings.placement == "adaptive" else None
@@ -67,7 +74,9 @@ class SectorBaker:
             rooms, around = self._scene.rooms, (self.rays, self._solids, _surfaces(geometry), index)
             found = fine_voxels.bake_fine_voxels(*around, placed, self._settings, rooms, trial, self.trial)
             fine = fine_file.encode(index, found, self._bake_id)
-        return BakedSector(index, sector_bytes, geometry_file.encode(index, geometry, self._bake_id), fine, meta)
+        # From the file's bytes: so a transfer that is found later, from a finished sector, is the same.
+        transfer = self.transfers.transfer(sector_file.decode(sector_bytes, f"sector {index}")[0])
+        return BakedSector(index, sector_bytes, geometry_file.encode(index, geometry, self._bake_id), fine, transfer, meta)
 
     def bake_arrays(self, index: SectorIndex, geometry: Geometry) -> tuple[Sector, dict[str, Any]]:
         """One sector's arrays before quantisation, and its meta. ``geometry`` is what SectorCutter.cut gives for it."""
@@ -197,7 +206,7 @@ def _surfaces(geometry: Geometry) -> Float64:
 
 def _distant_sky(sky: Float32, placed: placement.Placement) -> list[float]:
     """Mean sky factor of each cube face over a sector's outdoor probes: its distant texel (slide "Distant shading")."""
-    chosen = (placed.room == ROOM_OUTDOORS) & (placed.flags & PROBE_IN_MARGIN == 0)
+    chosen = of_texel(placed.room, placed.flags)
     if not chosen.any():
         return [0.0] * 6
     return [round(float(v), 5) for v in sky[chosen].mean(axis=0, dtype=np.float64)]

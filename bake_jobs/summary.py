@@ -22,7 +22,9 @@ def missed_target(world: WorldInfo) -> list[tuple[SectorIndex, float]]:
     return sorted(found, key=lambda pair: (-pair[1], pair[0]))
 
 
-def print_summary(console: Console, world: WorldInfo, core_seconds: float, wall_seconds: float, baked: int, workers: int) -> None:
+def print_summary(
+    console: Console, world: WorldInfo, distant_bytes: int, core_seconds: float, wall_seconds: float, baked: int, workers: int
+) -> None:
     """Print totals and means per sector. ``core_seconds`` is processor time over the ``baked`` sectors of this run."""
     counts = world.counts
     sectors = max(counts["sectors"], 1)
@@ -36,6 +38,7 @@ def print_summary(console: Console, world: WorldInfo, core_seconds: float, wall_
     if world.has_fine_voxels:
         fine = sum(facts.fine_bytes or 0 for facts in world.sectors.values())
         table.add_row("fine voxel files", f"{fine / 1e6:,.1f} MB", f"{fine / 1e3 / sectors:,.0f} kB")
+    table.add_row("distant texture", f"{distant_bytes / 1e6:,.1f} MB", f"{distant_bytes / 1e3 / sectors:,.1f} kB")
     if baked:
         table.add_row("core time", f"{core_seconds:,.1f} s", f"{core_seconds / baked:,.2f} s")
         table.add_row(f"time, {workers} processes", f"{wall_seconds:,.1f} s", f"{wall_seconds / baked:,.2f} s")
@@ -65,8 +68,8 @@ def print_own_errors(console: Console, world: WorldInfo, own: Mapping[SectorInde
     """Say where a target error is missed for what probes err by themselves (``own``), rather than for what lies between them."""
     found = [own[index] for index, error in missed_target(world) if own.get(index, 0.0) ** 2 > 0.5 * error**2]
     if found:
-        advice = "--quality standard has a finer sky" if world.sky == "faces" else "ask for more than that"
+        advice = "--quality standard has a finer sky" if world.sky == "faces" else "ask for a larger error"
         console.print(
-            f"in {len(found)} of them mostly by what probes err by themselves, {100 * np.median(found):.1f} % in the median: "
+            f"{len(found)} of those that miss it do so by what probes err by themselves, {100 * np.median(found):.1f} % in the median: "
             f"more probes do not mend that; {advice}"
         )

@@ -36,10 +36,11 @@ ZSTD_LEVEL = 12
 
 @dataclass(frozen=True)
 class Container:
-    """A file's contents: a small JSON object and named arrays."""
+    """A file's contents: a small JSON object and named arrays, in one of the format's versions."""
 
     meta: dict[str, Any]
     arrays: dict[str, AnyArray]
+    version: int
 
     def take(self, name: str, dtype: str, ndim: int) -> AnyArray:
         """The array of that name. Raises CorruptFileError when it is absent or of another dtype or rank."""
@@ -78,8 +79,8 @@ def encode(kind: str, version: int, meta: dict[str, Any], arrays: dict[str, AnyA
     return prefix[:_DIGEST_OFFSET] + digest + prefix[_DIGEST_OFFSET + 16 :] + header + payload
 
 
-def decode(data: bytes, kind: str, version: int, where: str) -> Container:
-    """Contents of a container's bytes; ``where`` names the file in errors.
+def decode(data: bytes, kind: str, version: int, where: str, oldest: int | None = None) -> Container:
+    """Contents of a container's bytes, of a version or one back to ``oldest``; ``where`` names the file in errors.
 
     Raises FormatVersionError for another kind or version, CorruptFileError for anything that does not fit together.
     """
@@ -88,9 +89,10 @@ def decode(data: bytes, kind: str, version: int, where: str) -> Container:
     magic, found_kind, found_version, header_bytes, _, payload_bytes, raw_bytes, digest = _PREFIX.unpack_from(data)
     if magic != MAGIC or found_kind != kind.encode():
         raise CorruptFileError(f"{where}: not a Sectorlight {kind} file (it starts with {data[:12]!r})")
-    if found_version != version:
+    if not (version if oldest is None else oldest) <= found_version <= version:
+        known = f"version {version}" if oldest is None else f"versions {oldest} to {version}"
         raise FormatVersionError(
-            f"{where}: format version {found_version}, this program reads version {version}; bake the dataset again with this program"
+            f"{where}: format version {found_version}, this program reads {known}; bake the dataset again with this program"
         )
     if header_bytes > MAX_HEADER_BYTES or raw_bytes > MAX_RAW_BYTES or len(data) != PREFIX_BYTES + header_bytes + payload_bytes:
         raise CorruptFileError(
@@ -107,7 +109,7 @@ def decode(data: bytes, kind: str, version: int, where: str) -> Container:
         raw = zstandard.ZstdDecompressor().decompress(payload, allow_extra_data=False) if raw_bytes else b""
         if not isinstance(parsed["meta"], dict):
             raise CorruptFileError(f"{where}: expected meta to be an object; bake it again")
-        return Container(parsed["meta"], _read_arrays(parsed["arrays"], raw, raw_bytes, where))
+        return Container(parsed["meta"], _read_arrays(parsed["arrays"], raw, raw_bytes, where), found_version)
     except (zstandard.ZstdError, ValueError, KeyError, TypeError, RecursionError) as error:
         if isinstance(error, CorruptFileError):
             raise

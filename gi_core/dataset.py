@@ -331,12 +331,13 @@ def fine_path(root: Path, index: SectorIndex) -> Path:
 
 
 class Dataset:
-    """Read access to a dataset. Files are read when asked for; nothing is kept."""
+    """Read access to a dataset. Files are read when asked for; of what is read only the distant texels are kept."""
 
     def __init__(self, path: Path, world: WorldInfo, digest: str) -> None:
         self.path = path
         self.world = world
         self.digest = digest  # 32 hexadecimal digits of everything that was baked
+        self._distant: DistantTexels | None = None
 
     @classmethod
     def open(cls, path: Path | str) -> "Dataset":
@@ -412,16 +413,29 @@ class Dataset:
         return voxels
 
     def distant(self) -> DistantTexels:
-        """Sky factors of all sectors' distant texels. Raises CorruptFileError."""
+        """All sectors' distant texels, for as long as this dataset is open. Raises CorruptFileError, FormatVersionError."""
+        if self._distant is None:
+            self._distant = self._read_distant()
+        return self._distant
+
+    @property
+    def distant_bytes(self) -> int:
+        """Bytes of the distant texels' file; 0 where there is none."""
+        path = self.path / DISTANT_FILE
+        return path.stat().st_size if path.is_file() else 0
+
+    def _read_distant(self) -> DistantTexels:
         path = self.path / DISTANT_FILE
         try:
             texels, bake_id = distant_file.read(path)
         except OSError as error:
             raise CorruptFileError(f"{path}: {error.strerror}; bake it again") from error
-        rows, columns = np.nonzero(texels.valid)
-        found = {SectorIndex(texels.origin.x + x, texels.origin.z + z) for z, x in zip(rows.tolist(), columns.tolist(), strict=True)}
-        if bake_id != self.world.bake_id or found != set(self.world.sectors):
-            raise CorruptFileError(f"{path}: holds {len(found)} sectors{_other_bake(bake_id, self.world)}; bake it again")
+        if bake_id != self.world.bake_id or set(texels.sectors()) != set(self.world.sectors):
+            raise CorruptFileError(f"{path}: holds {int(texels.valid.sum())} sectors{_other_bake(bake_id, self.world)}; bake it again")
+        transfer, planes = texels.transfer, self.world.sun_table.plane_count
+        if transfer is not None and (transfer.sky.shape[1], transfer.sun.shape[1]) != (self.world.sky_patches, planes):
+            found = f"{transfer.sky.shape[1]} sky patches and {transfer.sun.shape[1]} sun planes"
+            raise CorruptFileError(f"{path}: {found}, expected {self.world.sky_patches} and {planes}; bake it again")
         return texels
 
     def _expect(self, index: SectorIndex) -> None:

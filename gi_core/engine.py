@@ -23,6 +23,7 @@ from gi_core.constants import (
 )
 from gi_core.dataset import Dataset
 from gi_core.device import shared_device
+from gi_core.distant_file import DistantLight
 from gi_core.error_report import expected_error
 from gi_core.errors import FormatError, InputError, OutsideWorldError
 from gi_core.fine_volume import interpolated, merge
@@ -59,11 +60,13 @@ class Distant:
     values : (rows, cols, 6, 3) float32 [lx], rows towards +Z, columns towards +X
     origin : sector of texel (0, 0)
     valid : (rows, cols) uint8, 1 where the dataset has a sector
+    light : sky, as in the talk, or full: sun, lamps and all bounces too
     """
 
     values: Float32
     origin: SectorIndex
     valid: UInt8
+    light: DistantLight = "sky"
 
 
 @dataclass(frozen=True, eq=False)
@@ -293,11 +296,24 @@ class Engine:
         sectors, residual = tuple(box.index for box in boxes), self._residual(lit, light)
         return Volume(values, mask, first, sectors, basis, residual=residual, rooms=tuple(sorted(reached)))
 
-    def distant(self, lighting: Lighting) -> Distant:
-        """One texel per sector of the whole world, lit by the sky alone (slide "Distant shading"). Raises CorruptFileError."""
+    def distant(self, lighting: Lighting, light: DistantLight | None = None) -> Distant:
+        """One texel per sector of the whole world (slide "Distant shading").
+
+        light : sky, as in the talk, or full; None takes the best that was baked. Lamps are the dataset's own, as they were baked.
+        Raises InputError for a light that was not baked, CorruptFileError.
+        """
         texels = self.dataset.distant()
-        values = texels.sky[..., None] * face_exitance(lighting)
-        return Distant(values.astype(np.float32), texels.origin, texels.valid)
+        transfer = texels.transfer
+        if light == "full" and transfer is None:
+            raise InputError("light=full: this dataset's distant texture knows the sky alone; expected sky, or bake it again")
+        if light == "sky" or transfer is None:
+            values = texels.sky[..., None] * face_exitance(lighting)
+            return Distant(values.astype(np.float32), texels.origin, texels.valid)
+        world = self.dataset.world
+        values = np.zeros((*texels.valid.shape, 6, 3), np.float32)
+        given = relight_input(lighting, world.sun_table, world.sky, world.sky_patches)
+        values[texels.valid > 0] = transfer.light(given, lighting)
+        return Distant(values, texels.origin, texels.valid, "full")
 
     def probes(self, position: Float64, radius: float, lighting: Lighting) -> LitProbes:
         """Probes within ``radius`` [m] of a world position (3,) [m], each from the sector that it lies in: row by row, as stored.

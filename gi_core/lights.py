@@ -88,6 +88,11 @@ def is_on(schedule: str, clock: datetime, sun_is_up: bool) -> bool:
     return on <= now < off if on < off else now >= on or now < off
 
 
+def schedule_is_on(schedule: str, lighting: Lighting) -> bool:
+    """``is_on`` at a snapshot's time and under its sun."""
+    return is_on(schedule, datetime.fromisoformat(lighting.time), bool(lighting.sun.direction[1] > 0))
+
+
 def lamps_on(lamps: Iterable[Lamp], lighting: Lighting) -> tuple[Lamp, ...]:
     """Those that are on at the snapshot's time and under its sun, and give any light, in their order."""
     clock, sun_is_up = datetime.fromisoformat(lighting.time), bool(lighting.sun.direction[1] > 0)

@@ -113,7 +113,10 @@ class LiveWorld:
         self._light: LiveLight | None = None
         self._fading: set[SectorIndex] = set()
         """Sectors that are not yet shown as they are."""
-        self._distant_sky = dataset.distant()
+        self._distant = dataset.distant()
+        self._placeholders: dict[SectorIndex, Float32] = {}
+        """Of this tick's light."""
+        self._texel_of = {index: texel for texel, index in enumerate(self._distant.sectors())}
         self._shadows = LiveShadows(self._device, dataset) if shadow_map else None
 
     @property
@@ -149,6 +152,8 @@ class LiveWorld:
         report.evicted = self.plan.evictions
         lap("stream")
         gains_changed = self._light is not None and self._light.settings != light.settings
+        if light is not self._light:
+            self._placeholders.clear()
         self._light = light
         self._relight(tick, light, report)
         lap("relight")
@@ -266,8 +271,15 @@ class LiveWorld:
         return sector.shown(light.settings, lambda: self._placeholder(sector.resident.sector.index), self.basis)
 
     def _placeholder(self, index: SectorIndex) -> Float32:
-        """(6, 3) [lx]: the distant probe that stands in for a sector (slide "Distant shading")."""
-        texels = self._distant_sky
-        assert self._light is not None
-        sky = texels.sky[index.z - texels.origin.z, index.x - texels.origin.x]
-        return np.asarray(sky[:, None] * self._light.distant, np.float32)
+        """(6, 3) [lx]: the distant probe that stands in for a sector (slide "Distant shading"), in the best light that was baked."""
+        texels, light = self._distant, self._light
+        assert light is not None
+        if index not in self._placeholders:
+            if texels.transfer is None:
+                sky = texels.sky[index.z - texels.origin.z, index.x - texels.origin.x]
+                found = np.asarray(sky[:, None] * light.distant, np.float32)
+            else:
+                texel = self._texel_of[index]
+                found = texels.transfer.light(light.given, light.lighting, slice(texel, texel + 1))[0]
+            self._placeholders[index] = found
+        return self._placeholders[index]

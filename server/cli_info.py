@@ -36,6 +36,7 @@ def show_dataset(path: Path) -> None:
         "north": f"{place.north_degrees:g} degrees",
         "sectors": f"{len(world.sectors):,}",
         "sector files": f"{total_bytes:,} bytes" + (f", {total_bytes / len(world.sectors):,.0f} a sector" if world.sectors else ""),
+        "distant texture": f"{dataset.distant_bytes:,} bytes, light: {' or '.join(dataset.distant().lights)}",
         "bytes per probe": f"{total_bytes / probes:,.0f}" if probes else "no probe",
         "rooms, lamps, decals": f"{len(world.rooms)}, {len(world.lamps)}, {len(world.decals)}",
         "estimated error": "none was made" if world.estimated_error is None else f"{100 * world.estimated_error:.1f} % (median of sectors)",

@@ -13,6 +13,7 @@ from pydantic_core import PydanticCustomError
 from starlette.requests import HTTPConnection
 
 from gi_core.arrays import Float64
+from gi_core.distant_file import DistantLight
 from gi_core.errors import InputError
 from gi_core.json_fields import LARGEST_INTEGER
 from server.encoding import ArrayFormat, RawEncoding, VolumeFormat
@@ -120,6 +121,9 @@ class LiveQuery(StrictQuery):
 
 
 class DistantQuery(LightingQuery):
+    light: DistantLight | None = Field(
+        None, description="sky: the sky's direct light alone; full: sun, lamps as baked and all bounces too; none: full where it was baked"
+    )
     format: ArrayFormat = "npy"
     encoding: Literal["f16"] = "f16"
 

@@ -119,6 +119,7 @@ class WorldReply(BaseModel):
     bases: list[str] = Field(description="what `basis` of a volume may be: the bake's, those poorer than it, and cube, the default")
     kinds: list[str] = Field(description="what `kind` of a volume may be: outdoor, fog, and where there are rooms interior")
     cascades: list[int] = Field(description="what `cascade` of a volume may be: -1 where fine voxels were baked")
+    distant: list[str] = Field(description="what `light` of the distant texture may be, the default last")
     rooms: list[RoomReply]
     limits: LimitsReply
     dataset: dict[str, Any] = Field(description="digest, preset, basis, settings, counts and error report of the bake")

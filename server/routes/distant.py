@@ -19,16 +19,17 @@ def distant(request: Request, service: ServiceDep, query: Annotated[DistantQuery
     """Irradiance [lx] of one cube per sector, float32 (rows, cols, 6, 3); texel (0, 0) at the sector grid's north-west corner.
 
     Rows go south (+Z), columns east (+X). `raw`: little-endian halves (rows, cols, 6, 4); lux = rgb x scale; alpha is 0 where no
-    sector was baked. `Gi-Distant` has the origin.
+    sector was baked. `Gi-Distant` has the origin, and which light it is.
     """
     laps = Laps()
     with laps.lap("light"):
         light = service.lighting(query.time, query.weather)
-    etag = strong_etag("distant", REPLY_VERSION, service.dataset.digest, light.digest, query.format, query.encoding)
+    kind = query.light or service.dataset.distant().lights[-1]
+    etag = strong_etag("distant", REPLY_VERSION, service.dataset.digest, light.digest, kind, query.format, query.encoding)
 
     def compute() -> Body:
         with laps.lap("relight"):
-            found = service.engine.distant(light)
+            found = service.engine.distant(light, kind)
         with laps.lap("encode"):
             return distant_body(found, query)
 
@@ -47,6 +48,7 @@ def distant_body(found: Distant, query: DistantQuery) -> Body:
         "shape": list(values.shape) if query.format == "npy" else [*values.shape[:-1], 4],
         "dtype": "float32" if query.format == "npy" else "float16",
         "basis": "cube",
+        "light": found.light,
         "unit": "lx",
         "scale": scale,
     }

@@ -6,7 +6,8 @@ from fastapi import APIRouter, Query, Request, Response
 
 from gi_core.basis import served_from
 from gi_core.constants import MAX_PROBES_PER_SECTOR, SECTOR_SIZE_M, VOLUME_SHAPE, VOXEL_SIZE_M
-from gi_core.dataset import WorldInfo
+from gi_core.dataset import Dataset, WorldInfo
+from gi_core.errors import FormatError
 from gi_core.weather import WEATHER_RANGES, weather_presets
 from server.caching import Body, conditional, strong_etag
 from server.dependencies import MAX_CASCADE, MAX_DECAL_RADIUS_M, MAX_PREVIEW_WIDTH, MAX_PROBE_RADIUS_M, NoQuery, ServiceDep
@@ -19,17 +20,18 @@ router = APIRouter(prefix="/v1", tags=["dataset"])
 @router.get("/world", response_model=WorldReply)
 def world(request: Request, service: ServiceDep, _: Annotated[NoQuery, Query()]) -> Response:
     """What a client needs to know before it asks for light."""
-    etag = strong_etag("world", REPLY_VERSION, service.dataset.digest, weather_presets())
-    return conditional(
-        request,
-        etag,
-        lambda: Body(world_reply(service.dataset.world, service.dataset.digest).model_dump_json().encode(), "application/json"),
-    )
+    dataset = service.dataset
+    etag = strong_etag("world", REPLY_VERSION, dataset.digest, dataset.distant_bytes, weather_presets())
+    return conditional(request, etag, lambda: Body(world_reply(dataset).model_dump_json().encode(), "application/json"))
 
 
-def world_reply(info: WorldInfo, digest: str) -> WorldReply:
+def world_reply(dataset: Dataset) -> WorldReply:
     """A dataset's facts as the contract names them."""
-    place = info.location
+    info, place = dataset.world, dataset.world.location
+    try:
+        lights: list[str] = list(dataset.distant().lights)
+    except FormatError:  # /v1/distant says what is wrong with it; all else can be served
+        lights = []
     return WorldReply(
         name=info.name,
         bounds=BoundsReply(minimum=vector3(info.bounds[0]), maximum=vector3(info.bounds[1])),
@@ -51,6 +53,7 @@ def world_reply(info: WorldInfo, digest: str) -> WorldReply:
         bases=list(served_from(info.basis)),
         kinds=["outdoor", "fog", *(["interior"] if info.rooms else [])],
         cascades=list(range(-1 if info.has_fine_voxels else 0, MAX_CASCADE + 1)),
+        distant=lights,
         rooms=[RoomReply(number=n, name=r.name, minimum=r.minimum, maximum=r.maximum) for n, r in enumerate(info.rooms, 1)],
         limits=LimitsReply(
             probe_radius_m=MAX_PROBE_RADIUS_M,
@@ -59,7 +62,7 @@ def world_reply(info: WorldInfo, digest: str) -> WorldReply:
             probes_per_sector=MAX_PROBES_PER_SECTOR,
         ),
         dataset={
-            "digest": digest,
+            "digest": dataset.digest,
             "source": info.source,
             "preset": info.preset,
             "basis": info.basis,
@@ -67,6 +70,7 @@ def world_reply(info: WorldInfo, digest: str) -> WorldReply:
             "sky_patches": info.sky_patches,
             "settings": info.settings,
             "counts": info.counts,
+            "distant_bytes": dataset.distant_bytes,
             "error_report": info.error_report,
         },
     )

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from rich.console import Console
 
 from bake_jobs import runner
 from bake_jobs.runner import DatasetWriteError, bake
+from gi_core import distant_file
 from gi_core.dataset import Dataset, write_world
 from gi_core.errors import InputError, SourceError
 from gi_core.grid import SectorIndex
@@ -125,6 +127,17 @@ def test_only_missing_and_damaged_sectors_are_baked_again(source, reference, bak
     after = times(baked)
     assert {name for name in after if after[name] == before.get(name)} == {"sectors/2_1.gisec", "geometry/2_1.gigeo"}
     assert files(baked) == files(reference)
+
+
+def test_what_an_older_bake_lacks_of_distant_light_is_found_from_its_finished_sectors(source, reference, baked):
+    path, whole = baked / "distant.gidist", (reference / "distant.gidist").read_bytes()
+    texels, bake_id = distant_file.decode(whole, "whole")
+    assert texels.lights == ("sky", "full")
+    path.write_bytes(distant_file.encode(replace(texels, transfer=None), bake_id))
+    before = times(baked)
+    run(source, baked)
+    assert path.read_bytes() == whole
+    assert times(baked) == before
 
 
 def test_fine_voxels_are_files_of_their_own_and_baked_again_when_one_is_damaged(source, tmp_path):

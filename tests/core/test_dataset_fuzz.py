@@ -20,6 +20,7 @@ FILES = {
     "SECT": (GOLDEN / "sectors" / "0_0.gisec", sector_file.decode),
     "GEOM": (GOLDEN / "geometry" / "0_0.gigeo", geometry_file.decode),
     "DIST": (GOLDEN / "distant.gidist", distant_file.decode),
+    "DIST 2": (GOLDEN.parent / "distant_v2" / "distant.gidist", distant_file.decode),
 }
 
 
@@ -36,7 +37,7 @@ PARTS = {kind: parts(kind) for kind in FILES}
 def assemble(kind: str, header: Any, raw: bytes) -> bytes:
     text = json.dumps(header).encode()
     payload = zstandard.ZstdCompressor(level=1).compress(raw)
-    prefix = container._PREFIX.pack(container.MAGIC, kind.encode(), 1, len(text), 0, len(payload), len(raw), bytes(16))
+    prefix = container._PREFIX.pack(container.MAGIC, kind[:4].encode(), int(kind[4:] or 1), len(text), 0, len(payload), len(raw), bytes(16))
     return prefix[:40] + container._digest(prefix, text, payload) + prefix[56:] + text + payload
 
 

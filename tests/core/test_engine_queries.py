@@ -272,7 +272,7 @@ def test_probes_are_those_within_the_radius(engine, radius):
 
 def test_open_ground_sees_the_whole_sky_from_far_away(plane):
     light = plane.lighting(*NOON)
-    distant = plane.distant(light)
+    distant = plane.distant(light, "sky")
     assert distant.values.shape == (2, 3, 6, 3)
     assert distant.origin == (-1, 0)
     assert distant.valid.all()

@@ -455,6 +455,27 @@ def test_nothing_pops_when_a_sector_arrives_late(tmp_path, engine):
         world.close()
 
 
+def test_a_sector_that_is_not_there_is_lit_like_its_distant_texel_in_full(tmp_path, engine):
+    city = tmp_path / "city"
+    shutil.copytree(GOLDEN.parent / "v4", city)
+    shutil.copy(GOLDEN.parent / "distant_v2" / "distant.gidist", city)
+    sector_path(city, SectorIndex(-1, 0)).write_bytes(b"")
+    dataset = Dataset.open(city)
+    world = LiveWorld(dataset, shadow_map=False)
+    try:
+        for moment in ("12:00", "09:00"):
+            lighting = engine.lighting(moment, "clear")
+            run = Run(world)
+            run.until(at(STREET), light_of(world, lighting), lambda r: world.published("p0") and "p0" in r.filled)
+            texel = Engine(dataset).distant(lighting)
+            assert texel.light == "full"
+            shown = world.published("p0").values[:, :, :, :4]
+            expected = np.broadcast_to(texel.values[0, 0][:, None, None, None], shown.shape)
+            np.testing.assert_allclose(shown, expected, rtol=1e-5)
+    finally:
+        world.close()
+
+
 def test_a_sector_that_cannot_be_read_leaves_the_distant_probe_and_is_tried_again(tmp_path, engine):
     city = tmp_path / "city"
     shutil.copytree(GOLDEN, city)

@@ -13,13 +13,15 @@ from pathlib import Path
 import numpy as np
 
 from bake_jobs.config import BakeSettings, settings_for
+from bake_jobs.distant_transfer import TransferBaker
 from bake_jobs.geometry_clip import SectorCutter
 from bake_jobs.scene import Mesh, Scene, join_meshes
 from bake_jobs.sector_job import SectorBaker
 from bake_jobs.solids import boxes
-from gi_core import distant_file
+from gi_core import distant_file, sector_file
 from gi_core.container import write_atomic
-from gi_core.dataset import DISTANT_FILE, VERSION, SectorFacts, WorldInfo, fine_path, geometry_path, sector_path, write_world
+from gi_core.dataset import DISTANT_FILE, VERSION, Dataset, SectorFacts, WorldInfo, fine_path, geometry_path, sector_path, write_world
+from gi_core.distant_transfer import DistantTransfer
 from gi_core.grid import SectorIndex
 from gi_core.sun_table import SunTable
 from gi_core.world import Decal, Lamp, Location, Room
@@ -78,6 +80,7 @@ def write_golden(folder: Path, settings: BakeSettings = SETTINGS, scene: Scene |
     baker = SectorBaker(scene, settings, table.directions, BAKE_ID)
     sectors: dict[SectorIndex, SectorFacts] = {}
     sky: dict[SectorIndex, list[float]] = {}
+    transfers: dict[SectorIndex, DistantTransfer] = {}
     for index in SectorCutter(scene).sectors():
         baked = baker.bake(index)
         write_atomic(geometry_path(folder, index), baked.geometry_bytes)
@@ -89,8 +92,8 @@ def write_golden(folder: Path, settings: BakeSettings = SETTINGS, scene: Scene |
         counted = {name: baked.meta[name] for name in SectorFacts.__dataclass_fields__ if name in baked.meta}
         counted |= {"geometry_bytes": len(baked.geometry_bytes), "fine_bytes": None if fine is None else len(fine)}
         sectors[index] = SectorFacts(bytes=len(baked.sector_bytes), digest=digest, **counted)
-        sky[index] = baked.meta["distant_sky"]
-    write_atomic(folder / DISTANT_FILE, distant_file.encode(distant_file.assemble(sky), BAKE_ID))
+        sky[index], transfers[index] = baked.meta["distant_sky"], baked.transfer
+    write_atomic(folder / DISTANT_FILE, distant_file.encode(distant_file.assemble(sky, transfers), BAKE_ID))
     world = WorldInfo(
         name=scene.name,
         source="tests/golden/make_golden.py",
@@ -112,6 +115,19 @@ def write_golden(folder: Path, settings: BakeSettings = SETTINGS, scene: Scene |
     )
     write_world(folder, world)
     return world
+
+
+def write_distant(target: Path) -> None:
+    """Version 2 of the distant file, of the sectors of v4: a file that v4 may have in its own one's place."""
+    golden = Path(__file__).parent / "v4"
+    table = Dataset.open(golden).world.sun_table
+    baker = TransferBaker(scene_v4(), table.directions, SETTINGS.sky_sources)
+    found = {SectorIndex(x, 0): sector_file.read(sector_path(golden, SectorIndex(x, 0))) for x in (-1, 0)}
+    texels = distant_file.assemble(
+        {index: meta["distant_sky"] for index, (_, meta) in found.items()},
+        {index: baker.transfer(sector) for index, (sector, _) in found.items()},
+    )
+    write_atomic(target, distant_file.encode(texels, BAKE_ID))
 
 
 if __name__ == "__main__":

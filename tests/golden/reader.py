@@ -141,8 +141,10 @@ def read_geometry(data: bytes) -> tuple[dict[str, Any], Arrays]:
 
 
 def read_distant(data: bytes) -> tuple[dict[str, Any], Arrays]:
-    """meta, sky and valid (section 5)."""
-    return read_container(data, "DIST")
+    """meta, sky and valid, and of version 2 what is there for the valid texels (section 5)."""
+    (version,) = struct.unpack_from("<I", data, 12)
+    assert version in (1, 2)
+    return read_container(data, "DIST", version)
 
 
 def read_fine(data: bytes) -> tuple[dict[str, Any], Arrays]:

@@ -31,6 +31,8 @@ DIGESTS = {
 GOLDEN = HERE / "v1"
 SECTORS = sorted(path for version in DIGESTS for path in (HERE / f"v{version}" / "sectors").iterdir())
 GEOMETRIES = sorted(path for version in DIGESTS for path in (HERE / f"v{version}" / "geometry").iterdir())
+DISTANT_V2 = HERE / "distant_v2" / "distant.gidist"
+DISTANT_V2_DIGEST = "8ff8db0362f7c783bcf00d4cdb5c4d1f"
 FINE = sorted((HERE / "v3" / "fine").iterdir())
 each_version = pytest.mark.parametrize("golden", [HERE / f"v{version}" for version in DIGESTS], ids=lambda path: path.name)
 
@@ -79,9 +81,8 @@ def test_every_golden_version_is_read_or_refused_by_name():
     versions = sorted(int(path.name[1:]) for path in HERE.glob("v*") if path.is_dir())
     assert versions == list(DIGESTS)
     assert versions[-1] == dataset.VERSION, "a new format version needs its golden dataset: run make_golden.py"
-    assert {sector_file.VERSION, geometry_file.VERSION, fine_file.VERSION, distant_file.VERSION} == {1}, (
-        "give tests of their v2 what these have"
-    )
+    assert {sector_file.VERSION, geometry_file.VERSION, fine_file.VERSION} == {1}, "give tests of their v2 what these have"
+    assert distant_file.VERSION == 2, "a new version needs its golden file, as distant_v2 is"
     for version in versions:
         assert json.loads((HERE / f"v{version}" / "world.json").read_bytes())["version"] == version
 
@@ -133,6 +134,18 @@ def test_distant_texels_read_from_format_md_alone_are_the_texels(golden):
     assert (list(texels.origin), bake_id) == (meta["origin"], meta["bake_id"])
     np.testing.assert_array_equal(texels.sky, expected["sky"])
     np.testing.assert_array_equal(texels.valid, expected["valid"])
+
+
+def test_distant_transfers_read_from_format_md_alone_are_the_transfers():
+    meta, expected = reader.read_distant(DISTANT_V2.read_bytes())
+    texels, bake_id = distant_file.read(DISTANT_V2)
+    transfer = texels.transfer
+    assert (list(texels.origin), bake_id, list(transfer.schedules)) == (meta["origin"], meta["bake_id"], meta["schedules"])
+    for name, values in (("sky_transfer", transfer.sky), ("sun_transfer", transfer.sun), ("glow", transfer.glow), ("sky", texels.sky)):
+        assert values.any()
+        np.testing.assert_array_equal(values, expected[name], err_msg=name)
+    digest = hashlib.blake2b(b"".join(expected[name].tobytes() for name in sorted(expected)), digest_size=16).hexdigest()
+    assert digest == DISTANT_V2_DIGEST
 
 
 @each_version
@@ -226,7 +239,8 @@ def test_a_dataset_made_today_is_described_by_format_md(tmp_path, golden):
             fine = dataset.fine_path(tmp_path, index)
             np.testing.assert_array_equal(reader.read_fine(fine.read_bytes())[1]["probe"], opened.fine_voxels(sector).probe)
             assert stored_arrays(fine) == stored_arrays(golden / "fine" / fine.name)
-    assert stored_arrays(tmp_path / "distant.gidist") == stored_arrays(golden / "distant.gidist")
+    assert stored_arrays(tmp_path / "distant.gidist") == stored_arrays(DISTANT_V2)
+    assert stored_arrays(golden / "distant.gidist") < stored_arrays(DISTANT_V2)
 
 
 def test_the_hexdump_in_format_md_is_the_golden_sector():

@@ -2,6 +2,8 @@
 
 import io
 import json
+import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +11,12 @@ import httpx
 import numpy as np
 import pytest
 
+from gi_core import distant_file
 from gi_core.constants import VOLUME_SHAPE, VOXEL_SIZE_M
+from server.app import create_app
+from server.settings import Settings
+
+LIGHTS = {"": {}, "sky": {"light": "sky"}, "full": {"light": "full"}}
 
 
 def array(reply: httpx.Response) -> np.ndarray:
@@ -145,6 +152,36 @@ def test_distant_covers_the_sector_grid(http: httpx.Client, moment: dict[str, An
     raw_facts = json.loads(raw.headers["Gi-Distant"])
     texels = np.frombuffer(raw.content, "<f2").reshape(raw_facts["shape"])
     np.testing.assert_allclose(texels[..., :3] * np.float32(raw_facts["scale"]), values, rtol=2**-11, atol=2**-25 * raw_facts["scale"])
+
+
+def test_distant_light_is_the_best_that_was_baked_unless_a_request_says(http: httpx.Client, moment: dict[str, Any]) -> None:
+    world = http.get("/v1/world").json()
+    assert world["distant"] == ["sky", "full"]
+    assert world["dataset"]["distant_bytes"] > 0
+    replies = {light: http.get("/v1/distant", params={**moment, **asked}) for light, asked in LIGHTS.items()}
+    said = {light: json.loads(reply.headers["Gi-Distant"])["light"] for light, reply in replies.items()}
+    assert said == {"": "full", "sky": "sky", "full": "full"}
+    assert replies[""].content == replies["full"].content
+    assert replies[""].headers["ETag"] == replies["full"].headers["ETag"] != replies["sky"].headers["ETag"]
+    sky, full = array(replies["sky"]), array(replies["full"])
+    # Nothing of the sky is below, and bounces only add to what comes from it.
+    assert not sky[:, :, 3].any()
+    assert full[:, :, 3].max() > 100
+    assert (full >= 0.99 * sky).all()
+
+
+def test_distant_light_that_was_not_baked_is_refused(serving: Any, city: Path, tmp_path: Path, moment: dict[str, Any]) -> None:
+    older = tmp_path / "older"
+    shutil.copytree(city, older)
+    texels, bake_id = distant_file.read(older / "distant.gidist")
+    (older / "distant.gidist").write_bytes(distant_file.encode(replace(texels, transfer=None), bake_id))
+    with serving(create_app(older, Settings())) as client:
+        assert client.get("/v1/world").json()["distant"] == ["sky"]
+        reply = client.get("/v1/distant", params=moment)
+        assert json.loads(reply.headers["Gi-Distant"])["light"] == "sky"
+        refused = client.get("/v1/distant", params={**moment, "light": "full"})
+        assert refused.status_code == 400
+        assert "bake it again" in refused.json()["detail"]
 
 
 def test_probes_are_within_the_radius(http: httpx.Client, moment: dict[str, Any], place: dict[str, Any]) -> None:
