@@ -68,8 +68,8 @@ def print_own_errors(console: Console, world: WorldInfo, own: Mapping[SectorInde
     """Say where a target error is missed for what probes err by themselves (``own``), rather than for what lies between them."""
     found = [own[index] for index, error in missed_target(world) if own.get(index, 0.0) ** 2 > 0.5 * error**2]
     if found:
-        advice = "--quality standard has a finer sky" if world.sky == "faces" else "ask for a larger error"
+        advice = "--quality standard has a finer sky" if world.sky == "faces" else "ask for a larger --target-error"
         console.print(
-            f"{len(found)} of those that miss it do so by what probes err by themselves, {100 * np.median(found):.1f} % in the median: "
-            f"more probes do not mend that; {advice}"
+            f"{len(found)} sectors miss their target by what probes err by themselves, {100 * np.median(found):.1f} % in the median, "
+            f"which more probes do not mend: {advice}"
         )

@@ -8,7 +8,7 @@ estimate       by the bake: what it measured at a few voxels (bake_jobs/served_e
 own            by the bake: what the estimate has over interpolation, in squares
 served         those voxels in a volume, with the light that the bake's own sources and bounces give its probes, beside the same
 
-What is measured, is under suns that are none of the bake's; the first line says how far off the nearest of those stands.
+Blended and served are measured under suns that are none of the bake's; the first line says how far off the nearest that it tried stands.
 """
 
 import re
