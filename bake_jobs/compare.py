@@ -30,9 +30,9 @@ import numpy as np
 from bake_jobs.compare_points import CLIENT_OFFSET_M, SectorPoints, choose_points, corner_voxels, nearest_open_voxel
 from bake_jobs.compare_report import StageSamples, summarise
 from bake_jobs.compare_states import DEFAULT_STATES, parse_states
-from bake_jobs.path_tracer import Estimate, PathTracer, Projector
+from bake_jobs.path_tracer import Estimate, PathTracer, Projector, cube_projector
 from bake_jobs.scene import Scene
-from gi_core.arrays import AnyArray, Float32, Float64, Int64
+from gi_core.arrays import Float32, Float64, Int64
 from gi_core.basis import conversion, projection_weights
 from gi_core.constants import BASIS_SIZES, FINE_VOXEL_SIZE_M, SECTOR_SIZE_M, VOLUME_SHAPE, VOXEL_NO_SECTOR, VOXEL_OUTDOORS
 from gi_core.dataset import Dataset
@@ -71,10 +71,7 @@ class Reference:
 
     def cubes(self, points: Float64) -> Estimate:
         """(n, 3) [m] -> Estimate of (n, 6, 3) [lx]: the six faces as the dataset's basis has them."""
-
-        def faces(directions: Float32) -> AnyArray:
-            return projection_weights(self.basis, directions) @ conversion(self.basis, "cube").T
-
+        faces = cube_projector(self.basis)
         return self._once(("cubes", self.basis), (points,), lambda seed: [self._projected(points, faces, seed)])[0]
 
     def exact(self, points: Float64, bases: tuple[str, ...]) -> list[Estimate]:

@@ -65,7 +65,8 @@ class BakeSettings:
     band_m [m] : adaptive probes stand up to this high above the street; above, a few carry the light
     fit_candidates : visible probes that a voxel's weights are fitted over
     fit_ridge : pull of fitted weights towards inverse distance; more: smoother, less exact
-    target_error : probes are added until the bake's own estimate of the error near surfaces is below; 0: probe_worth alone decides
+    target_error : probes are added until the bake's own estimate of the error near surfaces, measured at a few voxels, is below; 0:
+        probe_worth alone decides
     """
 
     preset: str = "talk"

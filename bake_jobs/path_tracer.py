@@ -28,7 +28,7 @@ from bake_jobs.lamp_sampling import LampSampler
 from bake_jobs.rays import SURFACE_OFFSET_M, RayScene
 from bake_jobs.snow import snow_attribute
 from gi_core.arrays import AnyArray, Float32, Float64, Int32
-from gi_core.basis import projection_weights
+from gi_core.basis import conversion, projection_weights
 from gi_core.constants import SKY_SHAPE
 from gi_core.errors import InputError
 from gi_core.lighting import Lighting
@@ -61,7 +61,16 @@ class Estimate:
 class PathTracer:
     """Irradiance of one scene by path tracing. Read-only once built; safe to share between threads."""
 
-    def __init__(self, vertices: Float64, triangles: Int32, albedo: Float32, emission: Float32, *, threads: int | None = None) -> None:
+    def __init__(
+        self,
+        vertices: Float64,
+        triangles: Int32,
+        albedo: Float32,
+        emission: Float32,
+        *,
+        threads: int | None = None,
+        rays: RayScene | None = None,
+    ) -> None:
         """
         Parameters
         ----------
@@ -70,6 +79,7 @@ class PathTracer:
         albedo : (m, 3) float32, linear sRGB, 0..1
         emission : (m, 3) float32 [cd m^-2], from both sides
         threads : how many chunks are traced at a time; all cores when None
+        rays : of these vertices and triangles, where they are built already
 
         Raises
         ------
@@ -82,7 +92,7 @@ class PathTracer:
                 raise InputError(f"path tracer: expected finite {name} >= 0")
         if (albedo > 1).any():
             raise InputError(f"path tracer: expected albedo <= 1, got {albedo.max()}")
-        self.rays = RayScene(vertices, triangles)
+        self.rays = rays or RayScene(vertices, triangles)
         self._albedo = np.ascontiguousarray(albedo, np.float32)
         self._emission = np.ascontiguousarray(emission, np.float32)
         self._emits = bool(emission.any())
@@ -251,6 +261,11 @@ class PathTracer:
         if snow == 0:
             return albedo
         return whitened(albedo, np.float32(snow) * snow_attribute(self.rays, start, normal))
+
+
+def cube_projector(basis: str) -> Projector:
+    """For ``PathTracer.projected_irradiance``: (n, 6, 3) [lx], the six faces as a basis has them."""
+    return lambda directions: projection_weights(basis, directions) @ conversion(basis, "cube").T
 
 
 def sky_radiance(sky: Float32, directions: AnyArray) -> Float32:

@@ -30,7 +30,7 @@ from bake_jobs.sanity import expect_sense
 from bake_jobs.scene import Scene, scene_digest
 from bake_jobs.scene_source import load_scene
 from bake_jobs.sector_job import SectorBaker
-from bake_jobs.summary import print_summary
+from bake_jobs.summary import print_own_errors, print_summary
 from gi_core import distant_file, fine_file, geometry_file, sector_file
 from gi_core.container import write_atomic
 from gi_core.dataset import (
@@ -53,7 +53,7 @@ from gi_core.sector import Sector
 from gi_core.sun_table import SunTable
 
 # Part of the bake id: raised whenever the same settings would give other bytes than before.
-BAKER_VERSION = 4
+BAKER_VERSION = 5
 SectorRange = tuple[tuple[int, int], tuple[int, int]]
 
 
@@ -89,6 +89,8 @@ class _Finished:
     seconds: float
     transfer: DistantTransfer | None = None
     """None where an earlier run baked the sector and left none."""
+    own_error: float | None = None
+    """What probes err by themselves; None where no target error asked."""
 
 
 def bake(
@@ -199,6 +201,7 @@ def bake(
         write_atomic(output / DISTANT_FILE, distant)
         write_world(output, world)
     print_summary(console, world, len(distant), sum(f.seconds for f in done.values()), wall_seconds, len(remaining), workers)
+    print_own_errors(console, world, {i: f.own_error for i, f in done.items() if f.own_error is not None})
     return world
 
 
@@ -281,7 +284,9 @@ def _finished(output: Path, index: SectorIndex, bake_id: str, has_fine: bool) ->
         if any(other != (index, bake_id) for other in [(sector.index, meta["bake_id"]), *others]):
             return None
         fine_bytes = fine.stat().st_size if has_fine else None
-        return _Finished(index, _facts(data, geometry.stat().st_size, fine_bytes, meta), meta["distant_sky"], 0.0)
+        return _Finished(
+            index, _facts(data, geometry.stat().st_size, fine_bytes, meta), meta["distant_sky"], 0.0, own_error=meta.get("own_error")
+        )
     except (OSError, FormatError, KeyError, TypeError, ValueError):
         return None  # damaged: bake it again
 
@@ -329,7 +334,7 @@ def _finish(index: SectorIndex, baked_earlier: _Finished | None) -> _Finished:
         write_atomic(sector_path(_output, index), baked.sector_bytes)
     fine_bytes = None if baked.fine_bytes is None else len(baked.fine_bytes)
     facts = _facts(baked.sector_bytes, len(baked.geometry_bytes), fine_bytes, baked.meta)
-    return _Finished(index, facts, baked.meta["distant_sky"], time.process_time() - started, baked.transfer)
+    return _Finished(index, facts, baked.meta["distant_sky"], time.process_time() - started, baked.transfer, baked.meta.get("own_error"))
 
 
 def _run(

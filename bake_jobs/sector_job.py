@@ -11,9 +11,11 @@ from bake_jobs.config import BakeSettings
 from bake_jobs.distant_transfer import TransferBaker, of_texel
 from bake_jobs.geometry_clip import SectorCutter
 from bake_jobs.inside import Solids
+from bake_jobs.path_tracer import PathTracer
 from bake_jobs.rays import RayScene
 from bake_jobs.scene import Scene
-from bake_jobs.target_error import probes_for_target
+from bake_jobs.served_error import ServedError
+from bake_jobs.target_error import TargetSearch
 from bake_jobs.trial_light import TrialScene
 from bake_jobs.trial_states import trial_states
 from gi_core import factor_weights, fine_file, geometry_file, sector_file
@@ -23,6 +25,10 @@ from gi_core.distant_transfer import DistantTransfer
 from gi_core.geometry_file import Geometry
 from gi_core.grid import SectorIndex
 from gi_core.sector import Sector
+from gi_core.sun_table import SunTable
+
+# What probes err by themselves changes a little with their number: it is measured so many times at most.
+BAKES_FOR_TARGET = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +50,8 @@ class SectorBaker:
     """Bakes sectors of one scene; what they share is built once."""
 
     def __init__(self, scene: Scene, settings: BakeSettings, sun_directions: Float64, bake_id: str) -> None:
-        """``sun_directions`` (D, 3), unit, world frame; ``bake_id`` identifies scene and settings in every file."""
+        """``sun_directions`` (D, 3), unit, world frame, with a target error those of the scene's SunTable; ``bake_id`` identifies scene and
+        settings in every file."""
         self._scene = scene
         self._settings = settings
         self._sun_directions = sun_directions
@@ -55,12 +62,12 @@ class SectorBaker:
         self.transfers = TransferBaker(scene, sun_directions, settings.sky_sources, self.rays)
         self._pattern = gbuffer.cube_map_pattern(settings.rays_per_face_edge, settings.basis)
         self.trial = self._trial_scene() if settings.placement == "adaptive" or settings.voxel_weights == "fitted" else None
+        self._served_error = self._judge() if settings.target_error and settings.placement == "adaptive" else None
 
     def bake(self, index: SectorIndex) -> BakedSector:
         """All files of one sector."""
         geometry = self.cutter.cut(index)
-        placed, trial = self.place(index)
-        sector, meta = self._arrays(index, geometry, placed, trial)
+        placed, trial, sector, meta = self._bake(index, geometry)
         sector_bytes = sector_file.encode(sector, meta, self._settings.sky_sources)
         fine = None
         if self._settings.voxel_levels > 1:
@@ -73,7 +80,27 @@ class SectorBaker:
 
     def bake_arrays(self, index: SectorIndex, geometry: Geometry) -> tuple[Sector, dict[str, Any]]:
         """One sector's arrays before quantisation, and its meta. ``geometry`` is what SectorCutter.cut gives for it."""
-        return self._arrays(index, geometry, *self.place(index))
+        return self._bake(index, geometry)[2:]
+
+    def _bake(self, index: SectorIndex, geometry: Geometry) -> tuple[placement.Placement, adaptive.Trial | None, Sector, dict[str, Any]]:
+        """Probes, what voxels were fitted to, arrays and meta. With a target error baked again, since probes err themselves."""
+        if self._served_error is None:
+            placed, trial = self.place(index)
+            return placed, trial, *self._arrays(index, geometry, placed, trial)
+        search = self._search(index)
+        count = search.probes()
+        for left in reversed(range(BAKES_FOR_TARGET)):
+            placed, trial = self._first(search, count)
+            sector, meta = self._arrays(index, geometry, placed, trial)
+            interpolation = meta.get("estimated_error", 0.0)
+            measured = self._served_error.of(sector, search.judged) or 0.0
+            own = float(np.sqrt(max(measured**2 - interpolation**2, 0.0)))
+            before, count = count, search.probes(own)
+            if left == 0 or count == before or measured <= self._settings.target_error:
+                break
+        if "estimated_error" in meta:
+            meta["estimated_error"], meta["own_error"] = round(max(measured, interpolation), 5), round(own, 5)
+        return placed, trial, sector, meta
 
     def _arrays(
         self, index: SectorIndex, geometry: Geometry, placed: placement.Placement, trial: adaptive.Trial | None
@@ -136,24 +163,39 @@ class SectorBaker:
         states = trial_states(self._sun_directions, bool(scene.lamps) or bool(scene.emission.any()))
         return TrialScene(self.rays, scene.albedo, scene.emission, scene.lamps, states, self._settings.trial_rays_per_face_edge)
 
+    def _judge(self) -> ServedError:
+        scene, settings = self._scene, self._settings
+        # Another process does another sector: one thread each.
+        tracer = PathTracer(scene.vertices, scene.triangles, scene.albedo, scene.emission, threads=1, rays=self.rays)
+        table = SunTable.build(scene.location, settings.sun_declination_step_degrees, settings.sun_hour_step_degrees)
+        return ServedError(tracer, scene.location, table, settings.sky, settings.sky_sources)
+
     def place(self, index: SectorIndex) -> tuple[placement.Placement, adaptive.Trial | None]:
-        """Probes, and where the voxels' weights are to be fitted, the trial light."""
+        """Probes, and where the voxels' weights are to be fitted, the trial light; a target error is taken to be interpolation's alone."""
         scene, settings, rays, solids, trial = self._scene, self._settings, self.rays, self._solids, self.trial
         if trial is None:
             return placement.place_probes(rays, solids, scene.bounds, index, settings, scene.rooms, scene.hints), None
+        if settings.placement == "adaptive":
+            search = self._search(index)
+            return self._first(search, search.probes() if settings.target_error else min(search.ranking.enough, settings.probe_budget))
         air = find_air(rays, solids, scene.bounds, index, settings, scene.rooms)
         light = trial.light(air.centre)
-        if settings.placement == "adaptive":
-            ranking = adaptive.rank_probes(rays, solids, index, settings, scene.rooms, scene.hints, air, light, trial)
-            count = min(ranking.enough, settings.probe_budget)
-            if settings.target_error:
-                count = probes_for_target(rays, ranking, trial.states, air, light, settings)
-            placed, cube = ranking.first(count)
-        else:
-            placed = placement.place_probes(rays, solids, scene.bounds, index, settings, scene.rooms, scene.hints)
-            cube = trial.light(placed.position).cube
-        fitted = adaptive.Trial(trial.states, air, light, cube) if settings.voxel_weights == "fitted" else None
-        return placed, fitted
+        placed = placement.place_probes(rays, solids, scene.bounds, index, settings, scene.rooms, scene.hints)
+        # Only for fitted weights is a grid's light tried out.
+        return placed, adaptive.Trial(trial.states, air, light, trial.light(placed.position).cube)
+
+    def _search(self, index: SectorIndex) -> TargetSearch:
+        """Ranked places for a sector's probes."""
+        scene, settings, rays, solids, trial = self._scene, self._settings, self.rays, self._solids, self.trial
+        assert trial is not None
+        air = find_air(rays, solids, scene.bounds, index, settings, scene.rooms)
+        light = trial.light(air.centre)
+        ranking = adaptive.rank_probes(rays, solids, index, settings, scene.rooms, scene.hints, air, light, trial)
+        return TargetSearch(rays, ranking, trial.states, air, light, settings)
+
+    def _first(self, search: TargetSearch, count: int) -> tuple[placement.Placement, adaptive.Trial | None]:
+        placed, cube = search.ranking.first(count)
+        return placed, search.trial(cube) if self._settings.voxel_weights == "fitted" else None
 
 
 def _surfaces(geometry: Geometry) -> Float64:

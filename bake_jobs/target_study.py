@@ -2,11 +2,13 @@
 
     python -m bake_jobs.target_study SOURCE X0:X1,Z0:Z1 OUTDIR     a table on stdout
 
-estimate   the bake's: median over faces of trial lights that no probe was placed and no weight fitted for, at voxels near surfaces
-blended    the same by the path tracer: traced at the probes, blended by the baked weights, beside traced at voxels near surfaces
-served     those voxels in a volume, with the light that the bake's own sources and bounces give its probes, beside the same
+interpolation  by the bake: median over faces of trial lights that no probe was placed and no weight fitted for, at voxels near surfaces
+blended        the same by the path tracer: traced at the probes, blended by the baked weights, beside traced at voxels near surfaces
+estimate       by the bake: what it measured at a few voxels (bake_jobs/served_error.py), or interpolation where that is more
+own            by the bake: what the estimate has over interpolation, in squares
+served         those voxels in a volume, with the light that the bake's own sources and bounces give its probes, beside the same
 
-Both are measured under suns that are none of the trial's; the first line says how far off the nearest of those stands.
+Blended and served are measured under suns that are none of the bake's; the first line says how far off the nearest that it tried stands.
 """
 
 import re
@@ -35,20 +37,36 @@ from gi_core.grid import volume_first_voxel, voxel_centre
 from gi_core.lighting import Lighting
 from gi_core.lights import lamps_on
 from gi_core.sector import Sector
+from gi_core.sector_file import read
 from gi_core.sun_table import SunTable
 
 PRESET = "standard"
 TARGETS = (0.10, 0.05, 0.03)
 STATES = ("morning=2026-05-02T09:20/clear", "afternoon=2026-08-30T16:10/partly_cloudy")
 POINTS, SAMPLES = 60, 512
+COLUMNS = (
+    "target",
+    "probes",
+    "core s",
+    "missed",
+    "interpolation",
+    "own",
+    "estimate",
+    "blended",
+    "served",
+    "ratio",
+    "estimate:served of each",
+)
 
 
 @dataclass
 class Measured:
-    """What one target came to. estimates : of the sectors that have one; blended, served : over all sectors and states"""
+    """What one target came to. estimates, own, each : of the sectors that have an estimate; blended, served : of all, in all states"""
 
     probes: list[int] = field(default_factory=list)
     estimates: list[float] = field(default_factory=list)
+    own: list[float] = field(default_factory=list)
+    each: list[StageSamples] = field(default_factory=list)
     blended: StageSamples = field(default_factory=StageSamples)
     served: StageSamples = field(default_factory=StageSamples)
 
@@ -70,16 +88,21 @@ def print_table(source: str, sectors: SectorRange, output: Path) -> None:
     known: dict[bytes, list[Estimate]] = {}
     for number, target in enumerate(TARGETS):
         folder = output / f"{target:g}"
-        bake(source, folder, PRESET, 1, sectors, console=Console(quiet=True), target_error=target)
+        seconds: list[float] = []
+        console = Console(quiet=True)
+        bake(source, folder, PRESET, 1, sectors, console=console, target_error=target, on_baked=seconds.append)
         dataset = Dataset.open(folder)
         if number == 0:
             lightings = _lightings(Engine(dataset))
             print("; ".join(f"{name}: {nearest_trial_sun(dataset, light):.0f} degrees" for name, light in lightings.items()))
-            print("\n| target | probes | estimate | sector by sector | blended | served |\n|---|---|---|---|---|---|")
+            print(f"\n| {' | '.join(COLUMNS)} |\n{'|---' * len(COLUMNS)}|")
         found = measure(dataset, tracer, known)
-        each = " ".join(f"{100 * estimate:.1f}" for estimate in found.estimates)
-        cells = [f"{100 * target:.0f}", f"{np.mean(found.probes):.0f}", f"{100 * np.median(found.estimates):.1f}", each]
-        cells += [_interval(samples) for samples in (found.blended, found.served)]
+        estimate, own = np.array(found.estimates), np.array(found.own)
+        low, high = _interval(found.served)
+        cells = [f"{100 * target:.0f}", f"{np.mean(found.probes):.0f}", f"{np.mean(seconds):.1f}", f"{(estimate > target).sum()}"]
+        cells += [f"{100 * np.median(error):.1f}" for error in (np.sqrt(estimate**2 - own**2), own, estimate)]
+        cells += [f"{_text(_interval(found.blended))}", f"{_text((low, high))}", f"{(low + high) / 2 / np.median(estimate):.2f}"]
+        cells += [" ".join(f"{100 * e:.1f}:{50 * sum(_interval(s)):.1f}" for e, s in zip(estimate, found.each, strict=True))]
         print(f"| {' | '.join(cells)} |", flush=True)
 
 
@@ -92,8 +115,11 @@ def measure(dataset: Dataset, tracer: PathTracer, known: dict[bytes, list[Estima
         if not facts.probes:
             continue
         found.probes.append(facts.probes)
+        served = StageSamples()
         if facts.estimated_error is not None:
             found.estimates.append(facts.estimated_error)
+            found.own.append(read(dataset.sector_path(index))[1]["own_error"])
+            found.each.append(served)
         sector, points = dataset.sector(index), points_of(tracer, dataset, index, POINTS, 0)
         lattice = points.near[:, [2, 0, 1]] + volume_first_voxel(points.eye)
         at = lattice - sector.voxel_first
@@ -107,7 +133,8 @@ def measure(dataset: Dataset, tracer: PathTracer, known: dict[bytes, list[Estima
             found.blended.add(mean, Estimate(truth.mean, np.hypot(truth.standard_error, noise)))
             y, z, x = points.near[own].T
             light = engine.volume(points.eye, lighting).values[:, y, z, x]
-            found.served.add(np.einsum("fb,bnc->nfc", conversion(basis, "cube"), light), truth)
+            for samples in (found.served, served):
+                samples.add(np.einsum("fb,bnc->nfc", conversion(basis, "cube"), light), truth)
     return found
 
 
@@ -131,9 +158,13 @@ def _lightings(engine: Engine) -> dict[str, Lighting]:
     return {state.name: engine.lighting(state.time, state.weather) for state in parse_states(STATES, engine.dataset.world.location)}
 
 
-def _interval(samples: StageSamples) -> str:
+def _interval(samples: StageSamples) -> tuple[float, float]:
     low, high = summarise(samples)["median_ci"]
-    return f"{100 * low:.1f} to {100 * high:.1f}"
+    return low, high
+
+
+def _text(interval: tuple[float, float]) -> str:
+    return f"{100 * interval[0]:.1f} to {100 * interval[1]:.1f}"
 
 
 if __name__ == "__main__":

@@ -51,8 +51,8 @@ class SectorFacts:
     """What world.json says of one sector: its files' bytes and digest, and what the bake counted.
 
     fine_bytes : of the file of fine voxels; None where the bake made none
-    estimated_error : median relative error that the bake expects of voxels near surfaces from interpolation alone; None where it tried
-        out no light, or the sector has no such voxel
+    estimated_error : median relative error that the bake expects of voxels near surfaces, from interpolation alone or, with a target
+        error, from all; None where it tried out no light, or the sector has no such voxel
     """
 
     bytes: int

@@ -110,7 +110,7 @@ def bake(
     restart: Annotated[bool, typer.Option("--restart/--resume", help="Bake finished sectors again, or keep them.")] = False,
     target_error: Annotated[
         float | None,
-        typer.Option(help="Place probes until the bake's estimate of what lies between them is below, as in 0.04; at most 1000 a sector."),
+        typer.Option(help="Place probes until the bake's estimate of its error near surfaces is below, as in 0.04; at most 1000 a sector."),
     ] = None,
 ) -> None:
     """Bake a city into a dataset. Interrupted with Ctrl-C, it keeps the sectors that are finished, and the same command bakes the rest."""

@@ -328,14 +328,18 @@ def test_the_bake_id_names_scene_settings_seed_and_versions(source, monkeypatch)
 
 def test_a_target_error_is_estimated_for_every_sector_and_misses_are_named(source, tmp_path):
     with (tmp_path / "said").open("w") as said:
-        world = bake(str(source), tmp_path / "out", "draft", 1, ((0, 2), (0, 1)), console=Console(file=said, width=200), target_error=0.001)
-    assert world.settings["target_error"] == 0.001
+        console = Console(file=said, width=200)
+        world = bake(str(source), tmp_path / "out", "draft", 1, ((0, 2), (0, 1)), console=console, target_error=0.01, knobs=["band_m=10"])
+    assert world.settings["target_error"] == 0.01
     estimates = {index: facts.estimated_error for index, facts in Dataset.open(tmp_path / "out").world.sectors.items()}
     assert all(estimate is not None for estimate in estimates.values())
     text = (tmp_path / "said").read_text()
     for index, estimate in estimates.items():
-        assert (f"{index.x},{index.z} ({100 * estimate:.1f} %)" in text) == (estimate > 0.001)
+        assert (f"{index.x},{index.z} ({100 * estimate:.1f} %)" in text) == (estimate > 0.01)
     assert "estimated error" in text
+    # Six sky scalars are no hundredth right, whatever lies between probes.
+    assert "by what probes err by themselves" in text
+    assert "--quality standard" in text
 
 
 def test_the_same_bake_once_more_keeps_its_error_report_and_any_other_drops_it(source, tmp_path):
