@@ -48,7 +48,8 @@ class BakeSettings:
     wall_spacing_m [m] : probes along walls, sideways and up to wall_doubling_m; less: more probes
     wall_doubling_m [m] : above this height over the scene's lowest point, the upward spacing doubles at every step
     wall_offset_m [m] : wall probes stand this far off their wall
-    margin_m [m] : probes are also placed this far beyond the sector's border, by the same rule, so that no seam shows
+    margin_m [m] : probes are also placed this far beyond the sector's border, by the same rule, so that no seam shows; of the grid more
+        than half of wall_spacing_m, or walls that cross a border have no probe beyond it
     cells_double_beyond_m [m] : surfel and brick cells double with every doubling of the closest probe's distance beyond this; more:
         more surfels. The slides give 1 m and 4 m, and no word on the distance; their 49 surfels a probe are out of reach without it
     sun_declination_step_degrees, sun_hour_step_degrees : spacing of the baked sun directions; less: sharper shadows, larger files
@@ -80,7 +81,7 @@ class BakeSettings:
     wall_spacing_m: float = 8.0
     wall_doubling_m: float = 12.0
     wall_offset_m: float = 1.0
-    margin_m: float = 4.0
+    margin_m: float = 4.75
     cells_double_beyond_m: float = 8.0
     sun_declination_step_degrees: float = 15.0
     sun_hour_step_degrees: float = 15.0
@@ -157,7 +158,7 @@ def settings_for(preset: str) -> BakeSettings:
             preset="draft",
             rays_per_face_edge=8,
             grid_spacing_m=8.0,
-            margin_m=8.0,
+            margin_m=8.75,
             wall_spacing_m=16.0,
             sun_declination_step_degrees=16.0,
             sun_hour_step_degrees=15.0,

@@ -57,7 +57,7 @@ class Streets:
         self._sectors = {index for index in sectors if index in known}
         near = {SectorIndex(i.x + dx, i.z + dz) for i in self._sectors for dx in (-1, 0, 1) for dz in (-1, 0, 1)}
         parts = {index: dataset.geometry(index) for index in sorted(near) if index in known}
-        self._rays = _ray_scene(list(parts.values()))
+        self._rays = ray_scene_of(list(parts.values()))
         self._ground = {i: float(standing_eye(self._rays, i, parts[i])[1]) - EYE_HEIGHT_M for i in sorted(self._sectors)}
         self._top = float(dataset.world.bounds[1][1]) + 1
 
@@ -149,7 +149,8 @@ def _points(path: Path) -> Float64:
     return lonlat
 
 
-def _ray_scene(parts: Sequence[Geometry]) -> RayScene:
+def ray_scene_of(parts: Sequence[Geometry]) -> RayScene:
+    """Sectors' geometries as one mesh."""
     starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     triangles = [part.triangles + start for part, start in zip(parts, starts, strict=False)]
     if not parts:

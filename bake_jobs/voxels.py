@@ -5,6 +5,8 @@ does that sees some: light does not end at a pillar, and trilinear sampling at a
 closest probe of its room instead, since the nearest air may be another's.
 
 Weights go by distance, or where light was tried out they are fitted to it (``voxel_weights="fitted"``).
+
+Towards a border a voxel gives up probes that the sector beyond does not hold: at the border line both sectors choose among the same.
 """
 
 from dataclasses import dataclass
@@ -21,7 +23,7 @@ from bake_jobs.rays import SURFACE_OFFSET_M, RayScene
 from bake_jobs.trial_fit import TrialFit
 from bake_jobs.voxel_classes import FILL_MARGIN, solid_voxels
 from gi_core.arrays import Bool, Float32, Float64, Int32, Int64, UInt8, UInt16
-from gi_core.constants import ROOM_OUTDOORS, VOXEL_INDOORS, VOXEL_OUTDOORS, VOXEL_SIZE_M, VOXEL_SOLID
+from gi_core.constants import ROOM_OUTDOORS, SECTOR_SIZE_M, VOXEL_INDOORS, VOXEL_OUTDOORS, VOXEL_SIZE_M, VOXEL_SOLID
 from gi_core.grid import SectorIndex, voxel_centre, voxel_columns
 from gi_core.rooms import rooms_of
 from gi_core.world import Room
@@ -30,6 +32,10 @@ from gi_core.world import Room
 # stands in the street.
 AIR_ABOVE_TOP_M = 4.0
 AIR_ABOVE_GROUND_M = 28.0
+# Probes that the sector beyond a border does not hold fade out over the last two voxels before it, and have to be replaced by some that it
+# does, which may be farther away than the usual candidates.
+FADE_M = 2 * VOXEL_SIZE_M
+CANDIDATES_AT_BORDER = 24
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,23 +123,46 @@ def blend(
             available = np.arange(len(placement.position))
         if len(members) == 0 or len(available) == 0:
             continue
-        candidates = min(settings.voxel_candidates, len(available))
-        distance, near = cKDTree(placement.position[available]).query(centre[members], k=candidates)
-        distance, near = distance.reshape(len(members), candidates), available[near.reshape(len(members), candidates)]
-        sees = _visible(ray_scene, centre[members], placement.position[near], distance)
-        blind_member = ~sees.any(axis=1)
-        sees[blind_member, 0] = True
-        blind[members] = blind_member
-        closeness = np.where(sees, 1 / np.maximum(distance, 0.25) ** 2, 0)
-        share = np.where(np.cumsum(sees, axis=1) <= k, closeness, 0)
-        if fit is not None:
-            share = fit.shares(members, near, closeness, share)
-        best = np.argsort(-share, axis=1, kind="stable")[:, :k]
-        rows = np.arange(len(members))[:, None]
-        probe[members, : best.shape[1]] = near[rows, best]
-        weight[members, : best.shape[1]] = share[rows, best] / share.sum(axis=1, keepdims=True)
+        tree = cKDTree(placement.position[available])
+        at_border = _to_line(centre[members]).min(axis=1) < FADE_M
+        for some, most in ((members[~at_border], settings.voxel_candidates), (members[at_border], CANDIDATES_AT_BORDER)):
+            candidates = min(max(most, settings.voxel_candidates), len(available))
+            distance, near = tree.query(centre[some], k=candidates)
+            distance, near = distance.reshape(len(some), candidates), available[near.reshape(len(some), candidates)]
+            sees = _visible(ray_scene, centre[some], placement.position[near], distance)
+            blind_member = ~sees.any(axis=1)
+            sees[blind_member, 0] = True
+            blind[some] = blind_member
+            kept = _kept(centre[some], placement.position[near], settings.margin_m)
+            closeness = np.where(sees, kept / np.maximum(distance, 0.25) ** 2, 0)
+            rows = np.arange(len(some))[:, None]
+            share = np.zeros_like(closeness)
+            closest = np.argsort(-closeness, axis=1, kind="stable")[:, :k]
+            share[rows, closest] = closeness[rows, closest]
+            if fit is not None:
+                share = fit.shares(some, near, closeness, share)
+            best = np.argsort(-share, axis=1, kind="stable")[:, :k]
+            probe[some, : best.shape[1]] = near[rows, best]
+            weight[some, : best.shape[1]] = share[rows, best] / share.sum(axis=1, keepdims=True)
     probe[weight == 0] = 0
     return probe, weight, blind
+
+
+def _to_line(position: Float64) -> Float64:
+    """(..., 2) [m]: how far positions (..., 3) [m] are from the nearest border line across x, and across z."""
+    place = position[..., [0, 2]] / SECTOR_SIZE_M
+    return np.asarray(np.abs(place - np.round(place)) * SECTOR_SIZE_M)
+
+
+def _kept(centre: Float64, probes: Float64, margin_m: float) -> Float64:
+    """(V, c), 0 to 1: what voxels (V, 3) keep of the weights of candidates (V, c, 3).
+
+    All of it where both sectors at a voxel's nearest border line hold the probe, otherwise a share that falls with the way to the line.
+    """
+    line = np.round(centre[:, [0, 2]] / SECTOR_SIZE_M) * SECTOR_SIZE_M
+    held_by_both = np.abs(probes[:, :, [0, 2]] - line[:, None]) < margin_m
+    share = np.minimum(_to_line(centre) / FADE_M, 1)[:, None]
+    return np.asarray(np.where(held_by_both, 1, share).prod(axis=2))
 
 
 def _visible(ray_scene: RayScene, centre: Float64, probes: Float64, distance: Float64) -> Bool:

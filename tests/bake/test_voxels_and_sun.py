@@ -3,8 +3,11 @@
 import numpy as np
 import pytest
 
-from bake_jobs.config import ADAPTIVE
+from bake_jobs.config import ADAPTIVE, settings_for
+from bake_jobs.inside import Solids
+from bake_jobs.placement import place_probes
 from bake_jobs.rays import SURFACE_OFFSET_M, RayScene
+from bake_jobs.voxels import blend
 from gi_core.constants import ROOM_OUTDOORS, VOXEL_INDOORS, VOXEL_OUTDOORS, VOXEL_SIZE_M, VOXEL_SOLID
 from gi_core.grid import SectorIndex, voxel_columns
 from gi_core.relight_twin import sun_bits
@@ -219,3 +222,22 @@ def test_snow_lies_on_what_is_flat_and_open(build, bake_arrays):
 def test_room_numbers_of_voxels_come_from_their_centres(hall):
     scene, sector, _ = hall
     np.testing.assert_array_equal(sector.voxel_room.reshape(-1), rooms_of(centres(sector).reshape(-1, 3), scene.rooms))
+
+
+@pytest.mark.parametrize("height", [5.0, 9.0])
+def test_at_a_border_both_sectors_blend_the_same_probes(build, height):
+    # A house on either side: probes along its walls are near, and each sector holds but its own. (Beside the roofs' many probes none of the
+    # street's is among the candidates, and each still blends its own.)
+    scene = build().ground().box((40, 0, 10), (56, 24, 50)).box((70, 0, 10), (90, 18, 50)).scene()
+    rays, settings = RayScene(scene.vertices, scene.triangles), settings_for("talk")
+    z = np.arange(12.0, 48.0, 2.0)
+    blends = []
+    for index, x in ((SectorIndex(0, 0), 64 - 1e-4), (SectorIndex(1, 0), 64 + 1e-4)):
+        placed = place_probes(rays, Solids(scene.vertices, scene.triangles), scene.bounds, index, settings, (), ())
+        at = np.stack([np.full_like(z, x), np.full_like(z, height), z], axis=1)
+        kind, room = np.full(len(at), VOXEL_OUTDOORS, np.uint8), np.zeros(len(at), np.uint16)
+        probe, weight, blind = blend(rays, at, kind, room, placed, settings, None)
+        assert not blind.any()
+        blends.append(np.einsum("nk,nka->na", weight, placed.position[probe]))
+    # The mean place of what is blended, the same but for a weight of 1e-4 / FADE_M: by distance alone it lies metres apart.
+    assert np.abs(blends[0] - blends[1]).max() < 0.01
