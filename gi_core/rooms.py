@@ -6,15 +6,18 @@ its room, what the nearest inside has: coordinates clamped to the room, worked o
 """
 
 import re
+from functools import lru_cache
 
 import numpy as np
 
 from gi_core.arrays import Bool, Float32, Float64, Int64, UInt8, UInt16
-from gi_core.constants import ROOM_OUTDOORS, VOXEL_OUTDOORS
+from gi_core.constants import OPENING_FAR_M, OPENING_NEAR_M, ROOM_CELL_M, ROOM_OUTDOORS, VOLUME_SHAPE, VOXEL_OUTDOORS, VOXEL_SIZE_M
 from gi_core.errors import InputError
 from gi_core.sector import Sector
-from gi_core.world import Room
+from gi_core.world import Room, RoomCells
 
+# Cells of a weight lattice along a voxel: as long as the way off a surface at which clients sample light.
+WEIGHT_CELLS = 4
 _FAR = np.int32(1 << 12)  # voxels; no two are as far apart
 
 
@@ -89,8 +92,102 @@ def find_room(rooms: tuple[Room, ...], wanted: str) -> int:
 
 def rooms_of(position: Float64, rooms: tuple[Room, ...]) -> UInt16:
     """Number of the first room that holds each world position (n, 3) [m], counting from 1; 0 outdoors."""
-    room = np.full(len(position), ROOM_OUTDOORS, np.uint16)
-    for number in range(len(rooms), 0, -1):
-        box = rooms[number - 1]
-        room[((position >= box.minimum) & (position <= box.maximum)).all(axis=1)] = number
-    return room
+    found = np.full(len(position), ROOM_OUTDOORS, np.uint16)
+    for number in _reached(position, rooms, 0.0)[::-1]:
+        found[holds(rooms[number - 1], position)] = number
+    return found
+
+
+def holds(room: Room, position: Float64, slack_m: float = 0.0) -> Bool:
+    """Which world positions (n, 3) [m] lie in a room, or up to ``slack_m`` (at most a cell's width) outside it."""
+    low, high = np.array(room.minimum) - slack_m, np.array(room.maximum) + slack_m
+    inside: Bool = np.asarray(((position >= low) & (position <= high)).all(axis=1), np.bool_)
+    if room.cells is not None and inside.any():
+        # The box ends at walls, cells beside them: what lies between the two is the room's.
+        cell = np.floor(position[inside] / ROOM_CELL_M).astype(np.int64) - room.cells.first
+        x, y, z = np.clip(cell, 0, np.array(room.cells.shape) - 1).T
+        inside[inside] = _air(room.cells, slack_m > 0)[y, z, x]
+    return inside
+
+
+def indoor_shares(position: Float64, rooms: tuple[Room, ...]) -> tuple[UInt16, Float32]:
+    """How the light at world positions (n, 3) [m] is mixed: the room (n,), and its share (n,) 0..1; the rest is the outdoor volume's.
+
+    Walls part the two sharply, whatever is how near; through an opening one becomes the other: within OPENING_NEAR_M of it both
+    sides take half of each, and from OPENING_FAR_M on none of the other's.
+    """
+    inside = rooms_of(position, rooms)
+    room, share = inside.copy(), (inside != ROOM_OUTDOORS).astype(np.float32)
+    for number in _reached(position, rooms, OPENING_FAR_M):
+        here = np.flatnonzero((inside == number) | (inside == ROOM_OUTDOORS))
+        half = opening_nearness(rooms[number - 1], position[here]) / 2
+        own = inside[here] == number
+        share[here[own]] = 1 - half[own]
+        nearer = ~own & (half > share[here])
+        room[here[nearer]], share[here[nearer]] = number, half[nearer]
+    return room, share
+
+
+def opening_nearness(room: Room, position: Float64) -> Float32:
+    """(n,): 1 up to OPENING_NEAR_M from the closest opening of a room, 0 from OPENING_FAR_M on, straight between."""
+    closest = np.full(len(position), np.inf)
+    for opening in room.openings:
+        beyond = position - np.clip(position, opening.minimum, opening.maximum)
+        np.minimum(closest, np.linalg.norm(beyond, axis=1), out=closest)
+    return np.clip((OPENING_FAR_M - closest) / (OPENING_FAR_M - OPENING_NEAR_M), 0, 1).astype(np.float32)
+
+
+def weight_lattice(first_voxel: Int64, rooms: tuple[Room, ...], numbers: tuple[int, ...]) -> UInt8:
+    """Where a volume's rooms are, and how near their openings, in a quarter of its voxels' size: (2, 64, 128, 128), y, z, x.
+
+    Plane 0 is 255 in the rooms of those ``numbers`` and 0 outside them; plane 1 is 255 times ``opening_nearness`` of the closest of them.
+    """
+    shape = tuple(WEIGHT_CELLS * n for n in VOLUME_SHAPE)
+    found = np.zeros((2, *shape), np.uint8)
+    size = VOXEL_SIZE_M / WEIGHT_CELLS
+    axes = [
+        (first_voxel[axis] * WEIGHT_CELLS + np.arange(count) + 0.5) * size for axis, count in ((0, shape[2]), (1, shape[0]), (2, shape[1]))
+    ]
+    for number in numbers:
+        room = rooms[number - 1]
+        near = [
+            slice(*np.searchsorted(axis, [low - OPENING_FAR_M, high + OPENING_FAR_M]).tolist())
+            for axis, low, high in zip(axes, room.minimum, room.maximum, strict=True)
+        ]
+        part = (near[1], near[2], near[0])
+        y, z, x = np.meshgrid(axes[1][near[1]], axes[2][near[2]], axes[0][near[0]], indexing="ij")
+        position = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
+        for plane, value in enumerate((holds(room, position).astype(np.float32), opening_nearness(room, position))):
+            here = found[(plane, *part)]
+            np.maximum(here, np.round(255 * value.reshape(here.shape)).astype(np.uint8), out=here)
+    return found
+
+
+def pack_cells(first: Int64, air: Bool) -> RoomCells:
+    """Cells (ny, nz, nx) of a room, the first at a lattice index (x, y, z)."""
+    ny, nz, nx = air.shape
+    x, y, z = first.tolist()
+    return RoomCells((x, y, z), (nx, ny, nz), np.packbits(air.reshape(-1), bitorder="little").tobytes())
+
+
+@lru_cache(maxsize=1024)
+def _air(cells: RoomCells, grown: bool) -> Bool:
+    """Which cells (ny, nz, nx) hold the room's air; ``grown`` : or have one beside them that does."""
+    nx, ny, nz = cells.shape
+    air = np.unpackbits(np.frombuffer(cells.bits, np.uint8), count=nx * ny * nz, bitorder="little").astype(np.bool_).reshape(ny, nz, nx)
+    if grown:
+        for axis in range(3):
+            beside = np.moveaxis(air.copy(), axis, 0)
+            air_along = np.moveaxis(air, axis, 0)
+            air_along[1:] |= beside[:-1]
+            air_along[:-1] |= beside[1:]
+    return air
+
+
+def _reached(position: Float64, rooms: tuple[Room, ...], margin_m: float) -> list[int]:
+    """Numbers of the rooms whose boxes, a margin wider, touch the box of some positions (n, 3): most of a city's do not."""
+    if not rooms or not len(position):
+        return []
+    low, high = np.array([room.minimum for room in rooms]), np.array([room.maximum for room in rooms])
+    touch = (low - margin_m <= position.max(axis=0)) & (high + margin_m >= position.min(axis=0))
+    return (np.flatnonzero(touch.all(axis=1)) + 1).tolist()
