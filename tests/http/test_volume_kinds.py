@@ -245,8 +245,31 @@ def test_a_header_tells_of_the_rooms_that_the_volume_reaches(http: httpx.Client,
     y, z, x = np.nonzero(mask == 2)
     centre = np.array(facts["origin"]) + 3.125 * np.stack([x, y, z], axis=1)
     reached = [r for r in rooms if ((centre >= r["minimum"]) & (centre <= r["maximum"])).all(axis=1).any()]
-    assert told == reached[:16]
+    assert told == [{name: r[name] for name in ("number", "name", "minimum", "maximum")} for r in reached[:16]]
     assert facts["rooms_reached"] == len(reached) > 0
+
+
+def test_a_weight_is_sharp_at_walls_and_smooth_through_openings(http: httpx.Client, noon: Place) -> None:
+    _, room, middle = room_in(http)
+    inside = {**noon, **dict(zip("xyz", middle.tolist(), strict=True))}
+    content, facts, _ = get(http, inside, kind="interior", weight=1)
+    weight = array(content)
+    assert (weight.shape, weight.dtype, facts["dtype"], facts["shape"]) == ((2, 64, 128, 128), np.uint8, "uint8", [2, 64, 128, 128])
+    assert get(http, inside, kind="interior", weight=1, format="raw")[0] == weight.tobytes()
+    assert facts["voxel_size"] == [0.78125] * 3
+    at = (
+        np.stack(np.meshgrid(*(np.arange(n) for n in weight.shape[1:]), indexing="ij"), axis=-1)[..., [2, 0, 1]] * 0.78125 + facts["origin"]
+    )
+    np.testing.assert_array_equal(weight[0] == 255, ((at >= room["minimum"]) & (at <= room["maximum"])).all(axis=-1))
+    assert set(np.unique(weight[0]).tolist()) == {0, 255}
+    # The closest opening, one by one.
+    distance = np.min([np.linalg.norm(at - np.clip(at, o["minimum"], o["maximum"]), axis=-1) for o in room["openings"]], axis=0)
+    np.testing.assert_allclose(weight[1], 255 * np.clip(2 - distance / 0.78125, 0, 1), atol=0.51)
+    # mask=1 says what it always said.
+    assert set(np.unique(array(get(http, inside, kind="interior", mask=1)[0])).tolist()) <= {0, 1, 2, 3}
+    for wrong in ({"mask": 1}, {"format": "ktx2"}):
+        assert "weight with kind=interior, format=npy or raw, and no mask" in refusal(http, inside, kind="interior", weight=1, **wrong)
+    assert "weight with kind=interior" in refusal(http, inside, weight=1)
 
 
 def test_a_header_stays_small_whatever_the_world_has() -> None:
