@@ -185,7 +185,7 @@ def _join_small(basin: Int32, size: Int64, outside: set[int]) -> None:
 def _with_walls(basin: Int32, cells: Cells) -> Int32:
     """Basins with the cells beside walls: each goes to that of a neighbour which nothing parts it from, the lowest number of several."""
     basin = basin.copy()
-    for _ in range(2):
+    for _ in range(2):  # twice: a corner of two walls
         wanting = (basin == 0) & ~cells.solid
         nearest = np.full(basin.shape, np.iinfo(np.int32).max, np.int32)
         for axis in range(3):

@@ -8,7 +8,6 @@ import pytest
 from bake_jobs.air_basins import find_basins
 from bake_jobs.room_search import world_rooms
 from bake_jobs.scene_source import load_scene
-from bake_jobs.solids import prism
 from gi_core.constants import ROOM_CELL_M
 from gi_core.errors import SourceError
 from gi_core.rooms import holds, rooms_of
@@ -18,30 +17,15 @@ WALL = 0.2
 DOOR, WINDOW = (1.0, 2.0), (1.4, 0.9, 2.2)  # widths [m], heads, and a sill
 
 
-def wall(block, start, end, height, holes=(), thick=WALL):
-    """An upright wall from start to end, each (x, z), with holes (from, bottom, to, top) along it [m]."""
-    start, end = np.array(start, float), np.array(end, float)
-    along = (end - start) / np.linalg.norm(end - start)
-    rings = [((0.0, -0.2), (np.linalg.norm(end - start), height)), *(((a, low), (b, high)) for a, low, b, high in holes)]
-    outlines = [np.array([(a, low), (b, low), (b, high), (a, high)]) for (a, low), (b, high) in rings]
-    vertices, triangles, _ = prism(outlines, -thick / 2, thick / 2)
-    s, across, up = vertices.T
-    normal = np.array([-along[1], along[0]])
-    plan = start + s[:, None] * along + across[:, None] * normal
-    upright = np.stack([plan[:, 0], up, plan[:, 1]], axis=1)
-    turned = np.linalg.det(np.array([[along[0], 0, along[1]], [normal[0], 0, normal[1]], [0, 1, 0]])) < 0
-    return block.add(upright, triangles[:, ::-1] if turned else triangles)
-
-
 def house(block, low, high, height=2.8, door=True, window=True, roof=True):
     """Four walls about the inside of a box on the ground (x, z), a roof, and in the walls at the lowest z and x a door and a window."""
     (x0, z0), (x1, z1), h = low, high, WALL / 2
     doors = [(2.0, -0.1, 2.0 + DOOR[0], DOOR[1])] if door else []
     windows = [(2.0, WINDOW[1], 2.0 + WINDOW[0], WINDOW[2])] if window else []
-    wall(block, (x0 - WALL, z0 - h), (x1 + WALL, z0 - h), height, doors)
-    wall(block, (x0 - WALL, z1 + h), (x1 + WALL, z1 + h), height)
-    wall(block, (x0 - h, z0 - WALL), (x0 - h, z1 + WALL), height, windows)
-    wall(block, (x1 + h, z0 - WALL), (x1 + h, z1 + WALL), height)
+    block.wall((x0 - WALL, z0 - h), (x1 + WALL, z0 - h), height, doors)
+    block.wall((x0 - WALL, z1 + h), (x1 + WALL, z1 + h), height)
+    block.wall((x0 - h, z0 - WALL), (x0 - h, z1 + WALL), height, windows)
+    block.wall((x1 + h, z0 - WALL), (x1 + h, z1 + WALL), height)
     if roof:
         block.box((x0 - WALL, height - 0.01, z0 - WALL), (x1 + WALL, height + 0.3, z1 + WALL))
     return block
@@ -80,23 +64,25 @@ def test_a_house_at_an_angle_is_a_room_too(build):
     turn = np.array([[np.cos(0.5), -np.sin(0.5)], [np.sin(0.5), np.cos(0.5)]])
     corners = np.array([(0, 0), (8, 0), (8, 6), (0, 6)]) @ turn.T
     for number in range(4):
-        wall(block, corners[number], corners[(number + 1) % 4], 2.8, [(3.0, -0.1, 4.0, 2.0)] if number == 0 else ())
+        block.wall(corners[number], corners[(number + 1) % 4], 2.8, [(3.0, -0.1, 4.0, 2.0)] if number == 0 else ())
     block.box((-10, 2.79, -10), (12, 3.1, 12))  # a roof that overhangs all of it
     (room,) = found(block)
     rng = np.random.default_rng(2)
     points = rng.uniform((-9, 0.1, -9), (11, 2.7, 11), (20_000, 3))
     local = points[:, [0, 2]] @ turn
-    inside = ((local > 0.1) & (local < [7.9, 5.9])).all(axis=1)
-    outside = ((local < -0.1) | (local > [8.1, 6.1])).any(axis=1)
-    # Beside walls that follow no axis a room's edge is as sharp as its cells.
-    assert holds(room, points[inside]).mean() > 0.97
-    assert holds(room, points[outside]).mean() < 0.01
+    # Beside walls that follow no axis a room's edge is as sharp as its cells: to half the diagonal of one, and the grown wall (4 cm).
+    edge = ROOM_CELL_M * np.sqrt(0.5) + 0.04
+    low, high = np.array([0, 0]) + WALL / 2, np.array([8, 6]) - WALL / 2
+    inside = ((local > low + edge) & (local < high - edge)).all(axis=1)
+    outside = ((local < low - edge) | (local > high + edge)).any(axis=1)
+    assert holds(room, points[inside]).all()
+    assert not holds(room, points[outside]).any()
     assert len(room.openings) >= 1
 
 
 def test_two_rooms_with_a_door_between_are_two(ground):
     block = house(ground, (10, 20), (20, 26))
-    wall(block, (15, 19.9), (15, 26.1), 2.8, [(2.0, -0.1, 3.0, 2.0)])
+    block.wall((15, 19.9), (15, 26.1), 2.8, [(2.0, -0.1, 3.0, 2.0)])
     first, second = found(block)
     assert (first.maximum[0], second.minimum[0]) == pytest.approx((14.9, 15.1), abs=2e-3)
     # The inner door leads to no open air; only the first room has a door and a window of its own.
