@@ -85,7 +85,7 @@ def walk_through(engine: Engine, start: Float64, end: Float64, lighting: Lightin
     outdoor = _sampled(engine.volume(middle, lighting, basis="cube"), place)
     indoor = _sampled(engine.interior(middle, lighting, basis="cube", room=str(touched[0])), place)
     hard = np.where(rooms_of(place, rooms) != ROOM_OUTDOORS, indoor, outdoor)
-    return Walk(place, outdoor, hard, outdoor + share * (indoor - outdoor))
+    return Walk(place, outdoor, hard, (1 - share) * outdoor + share * indoor)
 
 
 def largest_step(light: Float64) -> float:

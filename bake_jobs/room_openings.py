@@ -93,8 +93,8 @@ def walls_around(rays: RayScene, centre: Float64, cell_m: float) -> tuple[Float6
             near = distance <= _NEAR_CELLS * cell_m
             if near.any():
                 ends[axis] = sign * (sign * centre[near, axis] + distance[near]).max()
-    # To a tenth of a millimetre: rays are rounded.
-    return np.round(low, 4), np.round(high, 4)
+    # To a tenth of a millimetre: rays are rounded. No zero has a sign.
+    return np.round(low, 4) + 0.0, np.round(high, 4) + 0.0
 
 
 def point(position: Float64) -> tuple[float, float, float]:
