@@ -28,8 +28,8 @@ from gi_core.world import Room
 # Smaller air is part of what it opens into: a porch, a bay, a wardrobe. 2.5 m each way.
 MIN_ROOM_M3 = 15.0
 # A basin with more of its surface open to the outdoors is outdoors too, as an arcade is; so is one with more of its cells under the sky.
-# Shops and houses have 2 to 9 % of their surface in doors and windows.
-MAX_OPEN_SHARE, MAX_SKY_SHARE = 0.1, 0.1
+# Houses and shops have 2 to 7 % of their surface in doors and windows (counted in cells, which lack a rim of each).
+MAX_OPEN_SHARE, MAX_SKY_SHARE = 0.08, 0.1
 # Of a region, some 30 bytes each.
 MAX_REGION_CELLS = 1 << 24
 
