@@ -17,9 +17,9 @@ from bake_jobs.air_basins import contacts, find_basins
 from bake_jobs.covered_air import COLUMN_CELLS, MAX_CEILING_M, AirColumns, CoveredRegion, covered_regions
 from bake_jobs.ray_lines import cut_lattice
 from bake_jobs.rays import RayScene
-from bake_jobs.room_openings import authored_openings, opening_boxes, point, walls_around
+from bake_jobs.room_openings import SEAM_M, authored_openings, opening_boxes, point, walls_around
 from bake_jobs.scene import Scene, Search
-from gi_core.arrays import Bool, Int32, Int64
+from gi_core.arrays import Bool, Float64, Int32, Int64
 from gi_core.constants import ROOM_CELL_M
 from gi_core.errors import SourceError
 from gi_core.rooms import pack_cells, rooms_of
@@ -87,17 +87,34 @@ def rooms_in(region: CoveredRegion, columns: AirColumns, authored: tuple[Room, .
     for number, place in enumerate(find_objects(basin), 1):
         if number not in chosen or place is None:
             continue
-        air = basin[place] == number
-        first = cells.first + np.array([place[2].start, place[0].start, place[1].start])
-        at = np.argwhere(air)[:, [2, 0, 1]] + first
+        at = np.argwhere(basin[place] == number)[:, [2, 0, 1]] + cells.first
+        at += [place[2].start, place[0].start, place[1].start]
         column = at[np.lexsort((at[:, 1], at[:, 0], at[:, 2]))[0]] // COLUMN_CELLS
-        centre = (at + 0.5) * ROOM_CELL_M
+        centre = np.asarray((at + 0.5) * ROOM_CELL_M, np.float64)
         if (column[0], column[2]) in own and np.count_nonzero(rooms_of(centre, authored)) <= len(at) / 2:
             low, high = walls_around(columns.rays, centre, ROOM_CELL_M)
             near, corner, cuts = cells.around(place)
-            openings = opening_boxes(basin[near], number, chosen, cuts, corner, low, high)
-            rooms.append(Room("", point(low), point(high), openings, pack_cells(first, air)))
+            openings = opening_boxes(columns.rays, basin[near], number, chosen, cuts, corner, low, high)
+            air = _to_box(basin[near], number, chosen, cuts, corner, low, high)
+            rooms.append(Room("", point(low), point(high), openings, pack_cells(air)))
     return rooms
+
+
+def _to_box(basin: Int32, number: int, rooms: set[int], cuts: tuple[Bool, ...], first: Int64, low: Float64, high: Float64) -> Int64:
+    """Lattice indices (n, 3), x, y, z, of a room's cells, to the sides of its box and no farther: a seam may leave a doorway to the
+    room, or some of the floor before it to the outdoors.
+
+    basin : (ny, nz, nx) with ``cuts`` between cells; first : lattice index of cell (0, 0, 0); low, high : (3,) [m]
+    """
+    y, z, x = np.meshgrid(*(np.arange(count) for count in basin.shape), indexing="ij")
+    at = np.stack([x, y, z], axis=-1) + first
+    centre = (at + 0.5) * ROOM_CELL_M
+    beside = ((centre - low < SEAM_M) | (high - centre < SEAM_M))[..., [0, 2]].any(axis=-1)
+    lost = (basin > 0) & ~np.isin(basin, list(rooms)) & beside
+    air = basin == number
+    for _ in range(round(SEAM_M / ROOM_CELL_M)):
+        air = air | (lost & (_next_to(air.astype(np.int32), cuts) == 1))
+    return np.asarray(at[air & ((centre >= low) & (centre <= high)).all(axis=-1)], np.int64)
 
 
 def region_cells(region: CoveredRegion, columns: AirColumns) -> Cells:
@@ -186,13 +203,18 @@ def _with_walls(basin: Int32, cells: Cells) -> Int32:
     """Basins with the cells beside walls: each goes to that of a neighbour which nothing parts it from, the lowest number of several."""
     basin = basin.copy()
     for _ in range(2):  # twice: a corner of two walls
-        wanting = (basin == 0) & ~cells.solid
-        nearest = np.full(basin.shape, np.iinfo(np.int32).max, np.int32)
-        for axis in range(3):
-            along, to = np.moveaxis(basin, axis, 0), np.moveaxis(nearest, axis, 0)
-            open_ = ~np.moveaxis(cells.cuts[axis], axis, 0)
-            for here, there in ((slice(None, -1), slice(1, None)), (slice(1, None), slice(None, -1))):
-                to[here] = np.where(open_ & (along[there] > 0), np.minimum(to[here], along[there]), to[here])
-        found = wanting & (nearest < np.iinfo(np.int32).max)
+        nearest = _next_to(basin, cells.cuts)
+        found = (basin == 0) & ~cells.solid & (nearest > 0)
         basin[found] = nearest[found]
     return basin
+
+
+def _next_to(basin: Int32, cuts: tuple[Bool, ...]) -> Int32:
+    """Of each cell the lowest number above 0 of the neighbours that nothing parts it from; 0 where none has one."""
+    none = np.iinfo(np.int32).max
+    nearest = np.full(basin.shape, none, np.int32)
+    for axis, cut in enumerate(cuts):
+        along, to, open_ = np.moveaxis(basin, axis, 0), np.moveaxis(nearest, axis, 0), ~np.moveaxis(cut, axis, 0)
+        for here, there in ((slice(None, -1), slice(1, None)), (slice(1, None), slice(None, -1))):
+            to[here] = np.where(open_ & (along[there] > 0), np.minimum(to[here], along[there]), to[here])
+    return np.where(nearest == none, np.int32(0), nearest)

@@ -11,10 +11,10 @@ from functools import lru_cache
 import numpy as np
 
 from gi_core.arrays import Bool, Float32, Float64, Int64, UInt8, UInt16
-from gi_core.constants import OPENING_FAR_M, OPENING_NEAR_M, ROOM_CELL_M, ROOM_OUTDOORS, VOLUME_SHAPE, VOXEL_OUTDOORS, VOXEL_SIZE_M
+from gi_core.constants import OPENING_DEPTH_M, OPENING_LEAST_VIEW, ROOM_CELL_M, ROOM_OUTDOORS, VOLUME_SHAPE, VOXEL_OUTDOORS, VOXEL_SIZE_M
 from gi_core.errors import InputError
 from gi_core.sector import Sector
-from gi_core.world import Room, RoomCells
+from gi_core.world import Opening, Room, RoomCells
 
 # Cells of a weight lattice along a voxel: as long as the way off a surface at which clients sample light.
 WEIGHT_CELLS = 4
@@ -110,17 +110,20 @@ def holds(room: Room, position: Float64, slack_m: float = 0.0) -> Bool:
     return inside
 
 
-def indoor_shares(position: Float64, rooms: tuple[Room, ...]) -> tuple[UInt16, Float32]:
-    """How the light at world positions (n, 3) [m] is mixed: the room (n,), and its share (n,) 0..1; the rest is the outdoor volume's.
+def indoor_shares(position: Float64, rooms: tuple[Room, ...], surface: Float64 | None = None) -> tuple[UInt16, Float32]:
+    """How light sampled at world positions (n, 3) [m] is mixed: the room (n,), and its share (n,) 0..1; the rest is the outdoor volume's.
 
-    Walls part the two sharply, whatever is how near; through an opening one becomes the other: within OPENING_NEAR_M of it both
-    sides take half of each, and from OPENING_FAR_M on none of the other's.
+    surface : (n, 3) [m], of what is lit, and 2 cm off it: volumes are sampled farther off. None: the positions themselves
+
+    Walls part the two sharply, whatever is how near. In an opening both are halves; on either side of it the other's share falls as the
+    opening does from view. From a wall beside an opening nothing is seen of it, so no bright or dark seam surrounds windows.
     """
+    surface = position if surface is None else surface
     inside = rooms_of(position, rooms)
     room, share = inside.copy(), (inside != ROOM_OUTDOORS).astype(np.float32)
-    for number in _reached(position, rooms, OPENING_FAR_M):
+    for number in _reached(surface, rooms, OPENING_DEPTH_M + max((_reach(each) for each in rooms), default=0.0)):
         here = np.flatnonzero((inside == number) | (inside == ROOM_OUTDOORS))
-        half = opening_nearness(rooms[number - 1], position[here]) / 2
+        half = opening_nearness(rooms[number - 1], surface[here]) / 2
         own = inside[here] == number
         share[here[own]] = 1 - half[own]
         nearer = ~own & (half > share[here])
@@ -129,12 +132,38 @@ def indoor_shares(position: Float64, rooms: tuple[Room, ...]) -> tuple[UInt16, F
 
 
 def opening_nearness(room: Room, position: Float64) -> Float32:
-    """(n,): 1 up to OPENING_NEAR_M from the closest opening of a room, 0 from OPENING_FAR_M on, straight between."""
-    closest = np.full(len(position), np.inf)
+    """(n,) 0..1 at positions (n, 3) [m]: 1 in the openings of a room, 0 where each fills less than OPENING_LEAST_VIEW of half the view.
+
+    An opening is the rectangle across the shortest side of its box, seen from as much nearer as that is deep and OPENING_DEPTH_M; from
+    x and y off its corners, at a distance d, it has a solid angle of the sum of +- atan(x y / (d sqrt(x^2 + y^2 + d^2))).
+    """
+    nearness = np.zeros(len(position), np.float32)
     for opening in room.openings:
-        beyond = position - np.clip(position, opening.minimum, opening.maximum)
-        np.minimum(closest, np.linalg.norm(beyond, axis=1), out=closest)
-    return np.clip((OPENING_FAR_M - closest) / (OPENING_FAR_M - OPENING_NEAR_M), 0, 1).astype(np.float32)
+        low, high = np.array(opening.minimum), np.array(opening.maximum)
+        reach = OPENING_DEPTH_M + _reach_of(opening)
+        near = np.flatnonzero(((position >= low - reach) & (position <= high + reach)).all(axis=1))
+        axis = int(np.argmin(high - low))
+        depth = np.abs(position[near, axis] - (low[axis] + high[axis]) / 2) - (high[axis] - low[axis]) / 2 - OPENING_DEPTH_M
+        depth = np.maximum(depth, 1e-9)
+        u, v = (across for across in range(3) if across != axis)
+        angle = np.zeros(len(near))
+        for x, sign_x in ((high[u] - position[near, u], 1), (low[u] - position[near, u], -1)):
+            for y, sign_y in ((high[v] - position[near, v], 1), (low[v] - position[near, v], -1)):
+                angle += sign_x * sign_y * np.arctan2(x * y, depth * np.sqrt(x * x + y * y + depth * depth))
+        view = (angle / (2 * np.pi) - OPENING_LEAST_VIEW) / (1 - OPENING_LEAST_VIEW)
+        nearness[near] = np.maximum(nearness[near], np.clip(view, 0, 1).astype(np.float32))
+    return nearness
+
+
+def _reach_of(opening: Opening) -> float:
+    """How far [m] beyond OPENING_DEPTH_M from its box an opening may be near: a solid angle is at most area over squared distance."""
+    sides = sorted(np.subtract(opening.maximum, opening.minimum).tolist())
+    return float(np.sqrt(sides[1] * sides[2] / (2 * np.pi * OPENING_LEAST_VIEW)))
+
+
+@lru_cache(maxsize=1024)
+def _reach(room: Room) -> float:
+    return max((_reach_of(opening) for opening in room.openings), default=0.0)
 
 
 def weight_lattice(first_voxel: Int64, rooms: tuple[Room, ...], numbers: tuple[int, ...]) -> UInt8:
@@ -150,8 +179,9 @@ def weight_lattice(first_voxel: Int64, rooms: tuple[Room, ...], numbers: tuple[i
     ]
     for number in numbers:
         room = rooms[number - 1]
+        reach = OPENING_DEPTH_M + _reach(room)
         near = [
-            slice(*np.searchsorted(axis, [low - OPENING_FAR_M, high + OPENING_FAR_M]).tolist())
+            slice(*np.searchsorted(axis, [low - reach, high + reach]).tolist())
             for axis, low, high in zip(axes, room.minimum, room.maximum, strict=True)
         ]
         part = (near[1], near[2], near[0])
@@ -163,10 +193,12 @@ def weight_lattice(first_voxel: Int64, rooms: tuple[Room, ...], numbers: tuple[i
     return found
 
 
-def pack_cells(first: Int64, air: Bool) -> RoomCells:
-    """Cells (ny, nz, nx) of a room, the first at a lattice index (x, y, z)."""
-    ny, nz, nx = air.shape
-    x, y, z = first.tolist()
+def pack_cells(at: Int64) -> RoomCells:
+    """The cells of a room, at least one, by their lattice indices (n, 3), x, y, z."""
+    x, y, z = at.min(axis=0).tolist()
+    nx, ny, nz = (np.ptp(at, axis=0) + 1).tolist()
+    air = np.zeros((ny, nz, nx), np.bool_)
+    air[tuple((at - [x, y, z]).T[[1, 2, 0]])] = True
     return RoomCells((x, y, z), (nx, ny, nz), np.packbits(air.reshape(-1), bitorder="little").tobytes())
 
 

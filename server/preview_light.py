@@ -31,6 +31,8 @@ Beyond = Literal["on", "off", "client"]
 VolumeAt = Callable[[Float64, int], Volume]
 
 SAMPLE_OFFSET_M = VOXEL_SIZE_M / 4
+# Where openings are looked for: the reveals of a door lie in the very plane of its rim.
+SURFACE_OFFSET_M = 0.02
 # Neighbouring volumes overlap by 4 voxels along each axis, so that every sample lies between voxel centres even after snapping.
 TILE_M = (np.array([VOLUME_SHAPE[2], VOLUME_SHAPE[0], VOLUME_SHAPE[1]]) - 4) * VOXEL_SIZE_M
 # From an outermost voxel's centre to the other side's.
@@ -85,7 +87,7 @@ class ServedLight:
         # sample_volume reads this far off the surface, which may be the next volume's.
         points = position + SAMPLE_OFFSET_M * normal
         result = np.zeros((len(points), 3), np.float32)
-        for volume, some, share, is_room in self._parts(points, MAX_VOLUMES):
+        for volume, some, share, is_room in self._parts(points, position + SURFACE_OFFSET_M * normal, MAX_VOLUMES):
             light = sample_volume(volume.values, volume.origin, volume.voxel_size, position[some], normal[some])
             if self.distant is not None and not is_room:
                 near = near_share(volume.origin, points[some])
@@ -101,16 +103,16 @@ class ServedLight:
         Of the distant texture nothing is taken: it is of the streets, not of the air above them.
         """
         result, known = np.zeros((len(points), 3), np.float32), np.zeros(len(points), np.float32)
-        for volume, some, share, _ in self._parts(points, MAX_AIR_VOLUMES):
+        for volume, some, share, _ in self._parts(points, points, MAX_AIR_VOLUMES):
             mean = average(volume.values)[None]
             result[some] += share[:, None] * sample_coefficients(mean, volume.origin, volume.voxel_size, points[some])[:, 0]
             known[some] += share * near_share(volume.origin, points[some])
         return result, known
 
-    def _parts(self, points: Float64, most: int) -> Iterator[tuple[Volume, Int64, Float32, bool]]:
+    def _parts(self, points: Float64, surface: Float64, most: int) -> Iterator[tuple[Volume, Int64, Float32, bool]]:
         """Volumes, at most ``most`` of each room and of the open air, the points (k,) that each lights, its share of their light (k,), and
         whether it is a room's. The shares of a point sum to 1."""
-        room, indoors = indoor_shares(points, self.rooms)
+        room, indoors = indoor_shares(points, self.rooms, surface)
         for number in np.unique(np.append(room[indoors > 0], ROOM_OUTDOORS)).tolist():
             share = np.where(room == number, indoors, 0) if number else 1 - indoors
             there = np.flatnonzero(share > 0)

@@ -50,10 +50,12 @@ def volume(request: Request, service: ServiceDep, query: Annotated[VolumeQuery, 
     `kind=outdoor`: no light of rooms; a voxel in one holds what the nearest one outdoors has. `kind=interior`: of a room alone; every other
     voxel holds what the nearest inside has, and `rooms` in the header places its box: inside it sample this volume, else the outdoor
     one. `kind=fog`: outdoor light averaged over directions, (16, 32, 32, 3).
-    `kind=interior&weight=1`: what a step through a door is smooth with, in cells of a quarter voxel, uint8 (2, 64, 128, 128): plane 0, read
-    at the nearest cell, is 255 in the rooms and 0 outside; plane 1, read linearly, n = 0..1 as 0..255, tells how near an opening is. The
-    share of the interior volume is 1 - n / 2 inside and n / 2 outside: sharp at walls, continuous through openings. `/v1/world` has the
-    openings themselves, and n is 1 up to 0.78125 m from the closest of the room, 0 from 1.5625 m on, straight between.
+    `kind=interior&weight=1`: what makes a step through a door smooth, in cells of a quarter voxel, uint8 (2, 64, 128, 128). Plane 0, read
+    at the nearest cell, is 255 in the rooms and 0 outside; plane 1, read linearly, n = 0..1 as 0..255, tells how much an opening fills the
+    view. The share of the interior volume is 1 - n / 2 inside and n / 2 outside: sharp at walls, continuous through openings. Read plane 0
+    where volumes are sampled, plane 1 on the surface that is lit, 2 cm off it. From the openings of `/v1/world` n can be had exactly: of
+    each box take the rectangle across its shortest side, and its solid angle from 0.390625 m nearer than one is; n = clamp((angle / 2 pi -
+    0.25) / 0.75).
     `cascade=1..3`: voxels of twice, four and eight times the size, means of those inside them; `-1`: of half the size, where `/v1/world`
     says so. Each cascade covers the middle of the next: blend from one to the other over the last two voxels of the smaller.
     `mask=1`: uint8 (16, 32, 32), 0 solid, 1 outdoors, 2 indoors, 3 no sector there. The header `Gi-Volume` places it in the world.

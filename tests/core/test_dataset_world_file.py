@@ -119,7 +119,7 @@ def test_version_5_has_openings_and_cells_of_rooms_and_no_other_has(tmp_path):
     assert json.loads(json.dumps(world.to_json())) == RECORD_5
     hall, found = world.rooms
     assert (hall.is_found, hall.openings) == (False, (Opening((43.0, 0.0, 40.0), (44.0, 2.0, 40.0)),))
-    assert found.cells == pack_cells(np.array([-128, 0, 64]), l_of_cells())
+    assert found.cells == pack_cells(np.argwhere(l_of_cells())[:, [2, 0, 1]] + [-128, 0, 64])
     # Inside its box the room is an L.
     corner = np.array([[-49.0, 1, 26], [-49, 1, 31], [-41, 1, 26], [-41, 1, 31]])
     assert rooms_of(corner, world.rooms).tolist() == [2, 2, 2, 0]

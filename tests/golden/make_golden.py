@@ -79,7 +79,9 @@ def scene_v5() -> Scene:
     air[:, 8:, 12:] = False
     door = Opening((43.0, 0.0, 40.0), (44.0, 2.0, 40.0))
     window = Opening((-50.0, 1.0, 26.0), (-50.0, 2.0, 28.0))
-    found = Room("found-1", (-50.0, 0.0, 25.0), (-40.625, 3.125, 31.25), (window,), pack_cells(np.array([-128, 0, 64]), air))
+    found = Room(
+        "found-1", (-50.0, 0.0, 25.0), (-40.625, 3.125, 31.25), (window,), pack_cells(np.argwhere(air)[:, [2, 0, 1]] + [-128, 0, 64])
+    )
     return replace(scene, rooms=(replace(scene.rooms[0], openings=(door,)), found))
 
 
