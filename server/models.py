@@ -110,7 +110,9 @@ class RoomReply(BaseModel):
     minimum: Vector3
     maximum: Vector3
     found: bool = Field(description="the bake found it; of its box only the cells of `kind=interior&weight=1` are its air")
-    openings: list[OpeningReply] = Field(description="boxes, most of them flat, in which its air meets the open air: doors and windows")
+    openings: list[OpeningReply] = Field(
+        description="boxes, most of them flat, in which its air meets the open air: windows, and doors, which go on below the floor"
+    )
 
 
 class WorldReply(BaseModel):
