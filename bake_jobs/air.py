@@ -14,7 +14,7 @@ from bake_jobs.voxel_classes import FILL_MARGIN, solid_voxels
 from gi_core.arrays import Bool, Float64, Int64, UInt16
 from gi_core.constants import ROOM_OUTDOORS, SECTOR_SIZE_M, VOXEL_SIZE_M
 from gi_core.grid import SectorIndex, voxel_centre, voxel_columns
-from gi_core.rooms import rooms_of
+from gi_core.rooms import holds, rooms_of
 from gi_core.world import Room
 
 # Above the band: every fourth column, at these multiples of the band's height over the street.
@@ -112,4 +112,4 @@ def _room_lattice(room: Room, x: Int64, z: Int64) -> Int64:
     y = np.arange(int(np.floor(room.minimum[1] / VOXEL_SIZE_M)), int(np.ceil(room.maximum[1] / VOXEL_SIZE_M)) + 1)
     lattice = np.stack([a.ravel() for a in np.meshgrid(x[0], y, z[:, 0], indexing="ij")], axis=1)
     centre = voxel_centre(lattice)
-    return lattice[((centre >= room.minimum) & (centre <= room.maximum)).all(axis=1)]
+    return lattice[holds(room, centre)]

@@ -50,21 +50,21 @@ def _fan(points: Float64, directions: Float32) -> tuple[Float64, Float32]:
 
 
 class Solids:
-    """A scene's solids, ready to be asked what lies in them."""
+    """A scene's solids, ready to be asked what lies in them. ``grown`` : they, each a little larger, so that no two surfaces coincide."""
 
     def __init__(self, vertices: Float64, triangles: Int32) -> None:
         """vertices (v, 3) [m], world frame; triangles (m, 3), counter-clockwise seen from outside."""
-        self._rays = RayScene(*_grown(np.asarray(vertices, np.float64), triangles))
+        self.grown = RayScene(*_grown(np.asarray(vertices, np.float64), triangles))
 
     def contain(self, points: Float64) -> Bool:
         """(n,) bool for points (n, 3) [m], world frame."""
         inside = np.zeros(len(points), bool)
         # Most air sees straight up, and is done after one ray.
         up = np.tile(np.array([[0, 1, 0]], np.float32), (len(points), 1))
-        unsure = np.flatnonzero(self._rays.occluded(points, up))
+        unsure = np.flatnonzero(self.grown.occluded(points, up))
         unsure = unsure[self.votes(points[unsure], STEEP_DIRECTIONS) >= VOTES_FOR_SOLID]
         has_sides = self.votes(points[unsure], FLAT_DIRECTIONS) >= SIDES_FOR_SOLID
-        below = self._rays.closest(points[unsure], -up[unsure])
+        below = self.grown.closest(points[unsure], -up[unsure])
         inside[unsure] = has_sides | ~below.hit | below.from_back
         return inside
 
@@ -79,7 +79,7 @@ class Solids:
         going = np.arange(len(origins))
         position = np.array(origins, np.float64)
         for _ in range(MAX_CROSSINGS):
-            hits = self._rays.closest(position, directions[going])
+            hits = self.grown.closest(position, directions[going])
             net[going[hits.hit]] += np.where(hits.from_back[hits.hit], 1, -1)
             on = np.flatnonzero(hits.hit & (net[going] <= 0))
             if len(on) == 0:

@@ -5,11 +5,14 @@ import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
 from gi_core.arrays import Float32, Float64, Int32, Int64
 from gi_core.world import Decal, Lamp, Location, Room
+
+Search = Literal["none", "open", "all"]
 
 
 @dataclass(frozen=True)
@@ -56,7 +59,10 @@ class Mesh:
 
 @dataclass(frozen=True, eq=False)
 class SourceContent:
-    """What one source file holds, before it is cleaned and joined with others. location is None when the source knows no place."""
+    """What one source file holds, before it is cleaned and joined with others. location is None when the source knows no place.
+
+    search : which enclosed air is to be found as rooms beside the authored ones: "none", "open" (with openings), or "all"
+    """
 
     mesh: Mesh
     location: Location | None = None
@@ -65,6 +71,7 @@ class SourceContent:
     hints: tuple[ProbeHint, ...] = ()
     name: str = ""
     decals: tuple[Decal, ...] = ()
+    search: Search = "none"
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +123,7 @@ def join_meshes(meshes: Sequence[Mesh]) -> Mesh:
 
 
 def scene_digest(scene: Scene) -> str:
-    """32 hexadecimal digits that identify all of a scene that its sectors depend on: not its name, decals and dropped counts."""
+    """32 hexadecimal digits that identify all of a scene that its sectors depend on: not its name, decals, openings and dropped counts."""
     h = hashlib.blake2b(digest_size=16)
     for values, dtype in (
         (scene.vertices, np.dtype("<f8")),
@@ -128,7 +135,7 @@ def scene_digest(scene: Scene) -> str:
         h.update(np.ascontiguousarray(values, dtype).tobytes())
     said = [
         dataclasses.asdict(scene.location),
-        [dataclasses.asdict(room) for room in scene.rooms],
+        [room.box_json() | ({} if room.cells is None else {"cells": room.cells.bits.hex()}) for room in scene.rooms],
         [dataclasses.asdict(lamp) for lamp in scene.lamps],
         [dataclasses.asdict(hint) for hint in scene.hints],
     ]

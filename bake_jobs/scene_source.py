@@ -1,5 +1,6 @@
 """``load_scene``: any SOURCE that the bake command takes -> a clean Scene."""
 
+import dataclasses
 from pathlib import Path
 
 from bake_jobs.cityjson import load_cityjson
@@ -8,6 +9,7 @@ from bake_jobs.footprints import load_footprints
 from bake_jobs.geography import MapFrame
 from bake_jobs.mesh_source import MESH_SUFFIXES, load_mesh
 from bake_jobs.procedural import load_procedural
+from bake_jobs.room_search import world_rooms
 from bake_jobs.scene import Scene, SourceContent
 from bake_jobs.world_file import load_world_file
 from gi_core.errors import SourceError
@@ -36,7 +38,7 @@ def load_scene(source: str | Path) -> Scene:
     else:
         content, name = load_content(_existing(text), None), _stem(text)
     mesh, dropped = clean_mesh(content.mesh, text, content.rooms)
-    return Scene(
+    scene = Scene(
         mesh.vertices,
         mesh.triangles.astype("int32"),
         mesh.albedo,
@@ -49,6 +51,7 @@ def load_scene(source: str | Path) -> Scene:
         dropped,
         content.decals,
     )
+    return dataclasses.replace(scene, rooms=world_rooms(scene, content.search))
 
 
 def load_content(path: Path, frame: MapFrame | None) -> SourceContent:

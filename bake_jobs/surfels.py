@@ -22,6 +22,7 @@ from bake_jobs.gbuffer import GBuffer
 from gi_core.arrays import Float32, Float64, Int32, Int64, UInt8, UInt16
 from gi_core.constants import BRICK_CELL_M, MAX_BRICK_LEVEL, ROOM_OUTDOORS, SURFEL_CELL_M
 from gi_core.errors import SourceError
+from gi_core.rooms import holds
 from gi_core.world import Room
 
 CELLS_PER_BRICK = round(BRICK_CELL_M / SURFEL_CELL_M)
@@ -85,8 +86,7 @@ def rooms_of_hits(gbuffer: GBuffer, probe_room: UInt16, rooms: tuple[Room, ...])
     present = np.unique(probe_room[probe_room != ROOM_OUTDOORS])
     for slack, of_own_probes in ((ROOM_SLACK_M, True), (0.0, False)):
         for number in present[::-1]:
-            box = rooms[number - 1]
-            inside = ((air >= np.array(box.minimum) - slack) & (air <= np.array(box.maximum) + slack)).all(axis=1)
+            inside = holds(rooms[number - 1], air, slack)
             room[inside & (seen_from == number) if of_own_probes else inside] = number
     room[~gbuffer.hits.hit] = ROOM_OUTDOORS
     return room

@@ -36,6 +36,12 @@ class Table:
             raise self._wrong(key, "text", value)
         return value
 
+    def flag(self, key: str, default: bool) -> bool:
+        value = self.take(key, default)
+        if not isinstance(value, bool):
+            raise self._wrong(key, "true or false", value)
+        return value
+
     def choice(self, key: str, allowed: Sequence[str], default: str | None) -> str:
         value = self.text(key, default)
         if value not in allowed:

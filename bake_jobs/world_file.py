@@ -15,6 +15,10 @@ path = "city.glb"                      # relative to this file
 offset = [0.0, 0.0, 0.0]               # metres, added in the world frame
 albedo = [0.4, 0.4, 0.4]               # replaces the source's own, linear sRGB
 
+[rooms]                                # beside those below, find rooms: air that is enclosed, with openings that are small against it
+find = true
+closed = false                         # true: also air without any opening, as behind doors that are modelled shut
+
 [[room]]
 name = "lobby"
 minimum = [0.0, 0.0, 0.0]
@@ -55,7 +59,7 @@ import numpy as np
 
 from bake_jobs.geography import MapFrame, timezone_at
 from bake_jobs.lamp_file import read_lamp
-from bake_jobs.scene import Mesh, ProbeHint, SourceContent, join_meshes
+from bake_jobs.scene import Mesh, ProbeHint, Search, SourceContent, join_meshes
 from bake_jobs.table import Table, read_toml
 from gi_core.dataset import MAX_DECALS
 from gi_core.decals import MAX_SIZE_M, MAX_YAW_DEGREES, MIN_SIZE_M
@@ -77,6 +81,7 @@ def load_world_file(path: Path, load: Loader) -> SourceContent:
     frame = MapFrame(location.latitude_degrees, location.longitude_degrees, north) if location else None
     sources = [_source(table, path.parent, frame, north, load) for table in top.tables("source")]
     rooms = tuple(_room(table) for table in top.tables("room"))
+    search = _search(top.table("rooms"))
     lamps = tuple(read_lamp(table) for table in top.tables("lamp"))
     hints = tuple(_hint(table) for table in top.tables("hint"))
     decals = tuple(_decal(table) for table in top.tables("decal"))
@@ -92,7 +97,7 @@ def load_world_file(path: Path, load: Loader) -> SourceContent:
         if len(placed) > 1:
             raise SourceError(f"{path}: expected a [location] to place {len(placed)} georeferenced sources in one world, found none")
         location = placed[0].location if placed else dataclasses.replace(Location(), north_degrees=north)
-    return SourceContent(join_meshes([content.mesh for content in sources]), location, rooms, lamps, hints, name, decals)
+    return SourceContent(join_meshes([content.mesh for content in sources]), location, rooms, lamps, hints, name, decals, search)
 
 
 def _location(table: Table, north: float) -> Location:
@@ -132,6 +137,16 @@ def _room(table: Table) -> Room:
     minimum, maximum = _box(table)
     table.refuse_unknown()
     return Room(name, minimum, maximum)
+
+
+def _search(table: Table | None) -> Search:
+    if table is None:
+        return "none"
+    find, closed = table.flag("find", default=False), table.flag("closed", default=False)
+    table.refuse_unknown()
+    if closed and not find:
+        raise SourceError(f"{table.where}: closed: expected find = true with it, found closed alone")
+    return ("all" if closed else "open") if find else "none"
 
 
 def _decal(table: Table) -> Decal:

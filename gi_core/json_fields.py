@@ -40,11 +40,15 @@ class Fields:
             raise self._unlike(name, f"a whole number of {low}..{high}")
         return value
 
-    def text(self, name: str) -> str:
+    def has(self, name: str) -> bool:
+        """Whether there is such a member, and it is not null."""
+        return self._record.get(name) is not None
+
+    def text(self, name: str, longest: int = LONGEST_TEXT) -> str:
         """A string that can be written to a terminal and a reply."""
         value = self._record.get(name)
-        if not isinstance(value, str) or len(value) > LONGEST_TEXT or not _encodable(value):
-            raise self._unlike(name, f"a text of at most {LONGEST_TEXT} characters")
+        if not isinstance(value, str) or len(value) > longest or not _encodable(value):
+            raise self._unlike(name, f"a text of at most {longest} characters")
         return value
 
     def choice(self, name: str, allowed: tuple[str, ...]) -> str:
@@ -60,6 +64,14 @@ class Fields:
         if not isinstance(value, list) or len(value) != 3:
             raise self._unlike(name, "three numbers")
         x, y, z = (Fields({name: part}, self.where).number(name, low, high) for part in value)
+        return x, y, z
+
+    def triple(self, name: str, low: int, high: int) -> tuple[int, int, int]:
+        """Three whole numbers within low..high."""
+        value = self._record.get(name)
+        if not isinstance(value, list) or len(value) != 3:
+            raise self._unlike(name, "three whole numbers")
+        x, y, z = (Fields({name: part}, self.where).integer(name, low, high) for part in value)
         return x, y, z
 
     def mapping(self, name: str) -> dict[str, Any]:

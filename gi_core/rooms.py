@@ -6,15 +6,18 @@ its room, what the nearest inside has: coordinates clamped to the room, worked o
 """
 
 import re
+from functools import lru_cache
 
 import numpy as np
 
 from gi_core.arrays import Bool, Float32, Float64, Int64, UInt8, UInt16
-from gi_core.constants import ROOM_OUTDOORS, VOXEL_OUTDOORS
+from gi_core.constants import OPENING_DEPTH_M, OPENING_LEAST_VIEW, ROOM_CELL_M, ROOM_OUTDOORS, VOLUME_SHAPE, VOXEL_OUTDOORS, VOXEL_SIZE_M
 from gi_core.errors import InputError
 from gi_core.sector import Sector
-from gi_core.world import Room
+from gi_core.world import Opening, Room, RoomCells
 
+# Cells of a weight lattice along a voxel: as long as the way off a surface at which clients sample light.
+WEIGHT_CELLS = 4
 _FAR = np.int32(1 << 12)  # voxels; no two are as far apart
 
 
@@ -89,8 +92,134 @@ def find_room(rooms: tuple[Room, ...], wanted: str) -> int:
 
 def rooms_of(position: Float64, rooms: tuple[Room, ...]) -> UInt16:
     """Number of the first room that holds each world position (n, 3) [m], counting from 1; 0 outdoors."""
-    room = np.full(len(position), ROOM_OUTDOORS, np.uint16)
-    for number in range(len(rooms), 0, -1):
-        box = rooms[number - 1]
-        room[((position >= box.minimum) & (position <= box.maximum)).all(axis=1)] = number
-    return room
+    found = np.full(len(position), ROOM_OUTDOORS, np.uint16)
+    for number in _reached(position, rooms, 0.0)[::-1]:
+        found[holds(rooms[number - 1], position)] = number
+    return found
+
+
+def holds(room: Room, position: Float64, slack_m: float = 0.0) -> Bool:
+    """Which world positions (n, 3) [m] lie in a room, or up to ``slack_m`` (at most a cell's width) outside it."""
+    low, high = np.array(room.minimum) - slack_m, np.array(room.maximum) + slack_m
+    inside: Bool = np.asarray(((position >= low) & (position <= high)).all(axis=1), np.bool_)
+    if room.cells is not None and inside.any():
+        # The box ends at walls, cells beside them: what lies between the two is the room's.
+        cell = np.floor(position[inside] / ROOM_CELL_M).astype(np.int64) - room.cells.first
+        x, y, z = np.clip(cell, 0, np.array(room.cells.shape) - 1).T
+        inside[inside] = _air(room.cells, slack_m > 0)[y, z, x]
+    return inside
+
+
+def indoor_shares(position: Float64, rooms: tuple[Room, ...], surface: Float64 | None = None) -> tuple[UInt16, Float32]:
+    """How light sampled at world positions (n, 3) [m] is mixed: the room (n,), and its share (n,) 0..1; the rest is the outdoor volume's.
+
+    surface : (n, 3) [m], of what is lit, and 2 cm off it: volumes are sampled farther off. None: the positions themselves
+
+    Walls part the two sharply, whatever is how near. In an opening both are halves; on either side of it the other's share falls as the
+    opening does from view. From a wall beside an opening nothing is seen of it, so no bright or dark seam surrounds windows.
+    """
+    surface = position if surface is None else surface
+    inside = rooms_of(position, rooms)
+    room, share = inside.copy(), (inside != ROOM_OUTDOORS).astype(np.float32)
+    for number in _reached(surface, rooms, OPENING_DEPTH_M + max((_reach(each) for each in rooms), default=0.0)):
+        here = np.flatnonzero((inside == number) | (inside == ROOM_OUTDOORS))
+        half = opening_nearness(rooms[number - 1], surface[here]) / 2
+        own = inside[here] == number
+        share[here[own]] = 1 - half[own]
+        nearer = ~own & (half > share[here])
+        room[here[nearer]], share[here[nearer]] = number, half[nearer]
+    return room, share
+
+
+def opening_nearness(room: Room, position: Float64) -> Float32:
+    """(n,) 0..1 at positions (n, 3) [m]: 1 in the openings of a room, 0 where each fills less than OPENING_LEAST_VIEW of half the view.
+
+    An opening is the rectangle across the shortest side of its box, seen from as much nearer as that is deep and OPENING_DEPTH_M; from
+    x and y off its corners, at a distance d, it has a solid angle of the sum of +- atan(x y / (d sqrt(x^2 + y^2 + d^2))).
+    """
+    nearness = np.zeros(len(position), np.float32)
+    for opening in room.openings:
+        low, high = np.array(opening.minimum), np.array(opening.maximum)
+        reach = OPENING_DEPTH_M + _reach_of(opening)
+        near = np.flatnonzero(((position >= low - reach) & (position <= high + reach)).all(axis=1))
+        axis = int(np.argmin(high - low))
+        depth = np.abs(position[near, axis] - (low[axis] + high[axis]) / 2) - (high[axis] - low[axis]) / 2 - OPENING_DEPTH_M
+        depth = np.maximum(depth, 1e-9)
+        u, v = (across for across in range(3) if across != axis)
+        angle = np.zeros(len(near))
+        for x, sign_x in ((high[u] - position[near, u], 1), (low[u] - position[near, u], -1)):
+            for y, sign_y in ((high[v] - position[near, v], 1), (low[v] - position[near, v], -1)):
+                angle += sign_x * sign_y * np.arctan2(x * y, depth * np.sqrt(x * x + y * y + depth * depth))
+        view = (angle / (2 * np.pi) - OPENING_LEAST_VIEW) / (1 - OPENING_LEAST_VIEW)
+        nearness[near] = np.maximum(nearness[near], np.clip(view, 0, 1).astype(np.float32))
+    return nearness
+
+
+def _reach_of(opening: Opening) -> float:
+    """How far [m] beyond OPENING_DEPTH_M from its box an opening may be near: a solid angle is at most area over squared distance."""
+    sides = sorted(np.subtract(opening.maximum, opening.minimum).tolist())
+    return float(np.sqrt(sides[1] * sides[2] / (2 * np.pi * OPENING_LEAST_VIEW)))
+
+
+@lru_cache(maxsize=1024)
+def _reach(room: Room) -> float:
+    return max((_reach_of(opening) for opening in room.openings), default=0.0)
+
+
+def weight_lattice(first_voxel: Int64, rooms: tuple[Room, ...], numbers: tuple[int, ...]) -> UInt8:
+    """Where a volume's rooms are, and how near their openings, in a quarter of its voxels' size: (2, 64, 128, 128), y, z, x.
+
+    Plane 0 is 255 in the rooms of those ``numbers`` and 0 outside them; plane 1 is 255 times ``opening_nearness`` of the closest of them.
+    """
+    shape = tuple(WEIGHT_CELLS * n for n in VOLUME_SHAPE)
+    found = np.zeros((2, *shape), np.uint8)
+    size = VOXEL_SIZE_M / WEIGHT_CELLS
+    axes = [
+        (first_voxel[axis] * WEIGHT_CELLS + np.arange(count) + 0.5) * size for axis, count in ((0, shape[2]), (1, shape[0]), (2, shape[1]))
+    ]
+    for number in numbers:
+        room = rooms[number - 1]
+        reach = OPENING_DEPTH_M + _reach(room)
+        near = [
+            slice(*np.searchsorted(axis, [low - reach, high + reach]).tolist())
+            for axis, low, high in zip(axes, room.minimum, room.maximum, strict=True)
+        ]
+        part = (near[1], near[2], near[0])
+        y, z, x = np.meshgrid(axes[1][near[1]], axes[2][near[2]], axes[0][near[0]], indexing="ij")
+        position = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
+        for plane, value in enumerate((holds(room, position).astype(np.float32), opening_nearness(room, position))):
+            here = found[(plane, *part)]
+            np.maximum(here, np.round(255 * value.reshape(here.shape)).astype(np.uint8), out=here)
+    return found
+
+
+def pack_cells(at: Int64) -> RoomCells:
+    """The cells of a room, at least one, by their lattice indices (n, 3), x, y, z."""
+    x, y, z = at.min(axis=0).tolist()
+    nx, ny, nz = (np.ptp(at, axis=0) + 1).tolist()
+    air = np.zeros((ny, nz, nx), np.bool_)
+    air[tuple((at - [x, y, z]).T[[1, 2, 0]])] = True
+    return RoomCells((x, y, z), (nx, ny, nz), np.packbits(air.reshape(-1), bitorder="little").tobytes())
+
+
+@lru_cache(maxsize=1024)
+def _air(cells: RoomCells, grown: bool) -> Bool:
+    """Which cells (ny, nz, nx) hold the room's air; ``grown`` : or have one beside them that does."""
+    nx, ny, nz = cells.shape
+    air = np.unpackbits(np.frombuffer(cells.bits, np.uint8), count=nx * ny * nz, bitorder="little").astype(np.bool_).reshape(ny, nz, nx)
+    if grown:
+        for axis in range(3):
+            beside = np.moveaxis(air.copy(), axis, 0)
+            air_along = np.moveaxis(air, axis, 0)
+            air_along[1:] |= beside[:-1]
+            air_along[:-1] |= beside[1:]
+    return air
+
+
+def _reached(position: Float64, rooms: tuple[Room, ...], margin_m: float) -> list[int]:
+    """Numbers of the rooms whose boxes, a margin wider, touch the box of some positions (n, 3): most of a city's do not."""
+    if not rooms or not len(position):
+        return []
+    low, high = np.array([room.minimum for room in rooms]), np.array([room.maximum for room in rooms])
+    touch = (low - margin_m <= position.max(axis=0)) & (high + margin_m >= position.min(axis=0))
+    return (np.flatnonzero(touch.all(axis=1)) + 1).tolist()

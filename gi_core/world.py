@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from datetime import date
+from typing import Any
 
 import numpy as np
 
@@ -30,12 +31,47 @@ class Location:
 
 
 @dataclass(frozen=True)
+class Opening:
+    """An axis-aligned box, most often flat, in which the air of a room meets the open air. ``minimum`` and ``maximum`` as of a room."""
+
+    minimum: tuple[float, float, float]
+    maximum: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class RoomCells:
+    """The shape of a found room: which cells of ROOM_CELL_M of its box hold its air.
+
+    first : world lattice index (x, y, z) of cell (0, 0, 0); shape : cells along x, y, z
+    bits : a bit a cell, x fastest, then z, then y, the lowest bit of each byte first
+    """
+
+    first: tuple[int, int, int]
+    shape: tuple[int, int, int]
+    bits: bytes
+
+
+@dataclass(frozen=True)
 class Room:
-    """An axis-aligned box of indoor air. ``minimum`` and ``maximum`` are world positions (x, y, z) [m]."""
+    """Indoor air: an axis-aligned box, or the cells of one. ``minimum`` and ``maximum`` are world positions (x, y, z) [m].
+
+    cells : of a room that the bake found; None of an author's, who drew a box
+    """
 
     name: str
     minimum: tuple[float, float, float]
     maximum: tuple[float, float, float]
+    openings: tuple[Opening, ...] = ()
+    cells: RoomCells | None = None
+
+    @property
+    def is_found(self) -> bool:
+        """Whether the bake found it, and no author drew it."""
+        return self.cells is not None
+
+    def box_json(self) -> dict[str, Any]:
+        """What an author says of it, as JSON has it."""
+        return {"name": self.name, "minimum": self.minimum, "maximum": self.maximum}
 
 
 LAMP_KINDS = ("point", "spot", "area")

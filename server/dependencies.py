@@ -83,6 +83,9 @@ class VolumeQuery(PositionQuery, VolumeFormatQuery):
     room: str | None = Field(
         None, max_length=200, description="of kind=interior, a name or number of /v1/world; none: the room at x, y, z, or all rooms"
     )
+    weight: bool = Field(
+        False, description="of kind=interior, 1: where its rooms are and how near their openings, instead of light: uint8, npy or raw"
+    )
     basis: Literal["cube", "sh1", "sh2"] = Field(
         "cube", description="cube: +X -X +Y -Y +Z -Z; harmonics: 4 or 9 coefficients, where `/v1/world` says that they can be had"
     )
@@ -94,6 +97,8 @@ class VolumeQuery(PositionQuery, VolumeFormatQuery):
     def _fits_its_kind(self) -> "VolumeQuery":
         if self.kind != "interior" and self.room is not None:
             raise ValueError("room with kind=interior only")
+        if self.weight and (self.kind != "interior" or self.mask or self.format == "ktx2"):
+            raise ValueError("weight with kind=interior, format=npy or raw, and no mask")
         if self.kind == "interior" and self.cascade != 0:
             raise ValueError("cascade=0 of kind=interior")
         if self.kind == "fog" and self.basis != "cube":

@@ -99,11 +99,20 @@ class LimitsReply(BaseModel):
     probes_per_sector: int
 
 
+class OpeningReply(BaseModel):
+    minimum: Vector3
+    maximum: Vector3
+
+
 class RoomReply(BaseModel):
     number: int = Field(description="from 1; probes and interior volumes name rooms so")
     name: str
     minimum: Vector3
     maximum: Vector3
+    found: bool = Field(description="the bake found it; of its box only the cells of `kind=interior&weight=1` are its air")
+    openings: list[OpeningReply] = Field(
+        description="boxes, most of them flat, in which its air meets the open air: windows, and doors, which go on below the floor"
+    )
 
 
 class WorldReply(BaseModel):

@@ -1,6 +1,6 @@
 """Served light as a picture reads it: volumes, and beyond them the texture of distant sectors (slide "Distant shading").
 
-    in a room              its interior volume
+    in a room              its interior volume; at its openings, on both sides, a mix with the outdoor one (gi_core.rooms.indoor_shares)
     in a volume's box      the volume
     up to FADE_M beyond    its edge, faded into the texture
     farther                the texture alone
@@ -21,7 +21,7 @@ from gi_core.constants import ROOM_OUTDOORS, SECTOR_SIZE_M, VOLUME_SHAPE, VOXEL_
 from gi_core.engine import Distant, Engine
 from gi_core.errors import InputError
 from gi_core.lighting import Lighting
-from gi_core.rooms import rooms_of
+from gi_core.rooms import indoor_shares
 from gi_core.settings import Settings
 from gi_core.volume import Volume, sample_coefficients, sample_volume
 from gi_core.world import Decal, Room
@@ -31,6 +31,8 @@ Beyond = Literal["on", "off", "client"]
 VolumeAt = Callable[[Float64, int], Volume]
 
 SAMPLE_OFFSET_M = VOXEL_SIZE_M / 4
+# Where openings are looked for: the reveals of a door lie in the very plane of its rim.
+SURFACE_OFFSET_M = 0.02
 # Neighbouring volumes overlap by 4 voxels along each axis, so that every sample lies between voxel centres even after snapping.
 TILE_M = (np.array([VOLUME_SHAPE[2], VOLUME_SHAPE[0], VOLUME_SHAPE[1]]) - 4) * VOXEL_SIZE_M
 # From an outermost voxel's centre to the other side's.
@@ -54,7 +56,7 @@ class ServedLight:
     volume_at : the served volume around a world position (3,) [m], of a room or outdoors
     distant : what lies beyond the volumes; None: their edge goes on for ever
     player : (3,) [m], the one place that there is a volume around; None: as many as points need, at most MAX_VOLUMES
-    rooms : of the world; what lies in one reads its interior volume, and nothing beyond it
+    rooms : of the world; what lies in one reads its interior volume, and nothing beyond it but through an opening
     decals : of the world; they dim indirect light where a picture asks for occlusion
     """
 
@@ -85,14 +87,14 @@ class ServedLight:
         # sample_volume reads this far off the surface, which may be the next volume's.
         points = position + SAMPLE_OFFSET_M * normal
         result = np.zeros((len(points), 3), np.float32)
-        for volume, some, is_room in self._parts(points, MAX_VOLUMES):
-            result[some] = sample_volume(volume.values, volume.origin, volume.voxel_size, position[some], normal[some])
-            if self.distant is None or is_room:
-                continue
-            near = near_share(volume.origin, points[some])
-            far = np.flatnonzero(near < 1)
-            beyond = ambient_cube.evaluate(sample_distant(self.distant, points[some[far]]), normal[some[far]])
-            result[some[far]] += (1 - near[far])[:, None] * (beyond - result[some[far]])
+        for volume, some, share, is_room in self._parts(points, position + SURFACE_OFFSET_M * normal, MAX_VOLUMES):
+            light = sample_volume(volume.values, volume.origin, volume.voxel_size, position[some], normal[some])
+            if self.distant is not None and not is_room:
+                near = near_share(volume.origin, points[some])
+                far = np.flatnonzero(near < 1)
+                beyond = ambient_cube.evaluate(sample_distant(self.distant, points[some[far]]), normal[some[far]])
+                light[far] += (1 - near[far])[:, None] * (beyond - light[far])
+            result[some] += share[:, None] * light
         return result
 
     def mean_irradiance(self, points: Float64) -> tuple[Float32, Float32]:
@@ -101,17 +103,21 @@ class ServedLight:
         Of the distant texture nothing is taken: it is of the streets, not of the air above them.
         """
         result, known = np.zeros((len(points), 3), np.float32), np.zeros(len(points), np.float32)
-        for volume, some, _ in self._parts(points, MAX_AIR_VOLUMES):
+        for volume, some, share, _ in self._parts(points, points, MAX_AIR_VOLUMES):
             mean = average(volume.values)[None]
-            result[some] = sample_coefficients(mean, volume.origin, volume.voxel_size, points[some])[:, 0]
-            known[some] = near_share(volume.origin, points[some])
+            result[some] += share[:, None] * sample_coefficients(mean, volume.origin, volume.voxel_size, points[some])[:, 0]
+            known[some] += share * near_share(volume.origin, points[some])
         return result, known
 
-    def _parts(self, points: Float64, most: int) -> Iterator[tuple[Volume, Int64, bool]]:
-        """Volumes, at most ``most`` of each room and of the open air, the points (k,) that each lights, and whether it is a room's."""
-        room = rooms_of(points, self.rooms)
-        for number in np.unique(room).tolist():
-            there = np.flatnonzero(room == number)
+    def _parts(self, points: Float64, surface: Float64, most: int) -> Iterator[tuple[Volume, Int64, Float32, bool]]:
+        """Volumes, at most ``most`` of each room and of the open air, the points (k,) that each lights, its share of their light (k,), and
+        whether it is a room's. The shares of a point sum to 1."""
+        room, indoors = indoor_shares(points, self.rooms, surface)
+        for number in np.unique(np.append(room[indoors > 0], ROOM_OUTDOORS)).tolist():
+            share = np.where(room == number, indoors, 0) if number else 1 - indoors
+            there = np.flatnonzero(share > 0)
+            if not len(there):
+                continue
             if self.player is None:
                 centres, which = plan_volumes(points[there], most)
             else:
@@ -120,7 +126,8 @@ class ServedLight:
                 members = there[which == i]
                 volume = self.volume_at(centre, number)
                 for start in range(0, len(members), SAMPLES_AT_ONCE):
-                    yield volume, members[start : start + SAMPLES_AT_ONCE], number != ROOM_OUTDOORS
+                    some = members[start : start + SAMPLES_AT_ONCE]
+                    yield volume, some, share[some], number != ROOM_OUTDOORS
 
 
 def near_share(origin: Float64, points: Float64) -> Float32:

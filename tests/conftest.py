@@ -11,7 +11,7 @@ from bake_jobs.config import settings_for
 from bake_jobs.geometry_clip import SectorCutter
 from bake_jobs.scene import Scene
 from bake_jobs.sector_job import SectorBaker
-from bake_jobs.solids import boxes
+from bake_jobs.solids import boxes, prism
 from gi_core import factor_weights
 from gi_core.basis import basis_of_size, factor_shares
 from gi_core.grid import SectorIndex
@@ -144,6 +144,17 @@ class SceneBuilder:
         vertices, triangles = boxes(np.asarray(low, np.float64), np.asarray(high, np.float64))
         kept = np.repeat([face not in without for face in BOX_FACES], 2)
         return self.add(vertices, triangles[kept][:, ::-1] if inward else triangles[kept], albedo, emission)
+
+    def wall(self, start, end, height, holes=(), thick=0.2, albedo=0.5) -> "SceneBuilder":
+        """An upright wall about the line from start to end, each (x, z), 0.2 m into the ground; holes (from, bottom, to, top) along it."""
+        start, end = np.array(start, np.float64), np.array(end, np.float64)
+        length = np.linalg.norm(end - start)
+        along = (end - start) / length
+        outlines = [np.array([(a, low), (b, low), (b, high), (a, high)]) for a, low, b, high in ((0.0, -0.2, length, height), *holes)]
+        vertices, triangles, _ = prism(outlines, -thick / 2, thick / 2)
+        s, across, up = vertices.T
+        plan = start + s[:, None] * along + across[:, None] * np.array([-along[1], along[0]])
+        return self.add(np.stack([plan[:, 0], up, plan[:, 1]], axis=1), triangles[:, ::-1], albedo)
 
     def scene(self, **fields) -> Scene:
         first = np.cumsum([0, *(len(v) for v, _, _, _ in self._parts)])

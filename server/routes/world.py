@@ -9,10 +9,11 @@ from gi_core.constants import MAX_PROBES_PER_SECTOR, SECTOR_SIZE_M, VOLUME_SHAPE
 from gi_core.dataset import Dataset, WorldInfo
 from gi_core.errors import FormatError
 from gi_core.weather import WEATHER_RANGES, weather_presets
+from gi_core.world import Room
 from server.caching import Body, conditional, strong_etag
 from server.dependencies import MAX_CASCADE, MAX_DECAL_RADIUS_M, MAX_PREVIEW_WIDTH, MAX_PROBE_RADIUS_M, NoQuery, ServiceDep
 from server.encoding import REPLY_VERSION
-from server.models import BoundsReply, LimitsReply, LocationReply, RoomReply, SectorGridReply, WorldReply, vector3
+from server.models import BoundsReply, LimitsReply, LocationReply, OpeningReply, RoomReply, SectorGridReply, WorldReply, vector3
 
 router = APIRouter(prefix="/v1", tags=["dataset"])
 
@@ -54,7 +55,7 @@ def world_reply(dataset: Dataset) -> WorldReply:
         kinds=["outdoor", "fog", *(["interior"] if info.rooms else [])],
         cascades=list(range(-1 if info.has_fine_voxels else 0, MAX_CASCADE + 1)),
         distant=lights,
-        rooms=[RoomReply(number=n, name=r.name, minimum=r.minimum, maximum=r.maximum) for n, r in enumerate(info.rooms, 1)],
+        rooms=[room_reply(number, room) for number, room in enumerate(info.rooms, 1)],
         limits=LimitsReply(
             probe_radius_m=MAX_PROBE_RADIUS_M,
             decal_radius_m=MAX_DECAL_RADIUS_M,
@@ -74,6 +75,12 @@ def world_reply(dataset: Dataset) -> WorldReply:
             "error_report": info.error_report,
         },
     )
+
+
+def room_reply(number: int, room: Room) -> RoomReply:
+    """A room, and where its air meets the open air."""
+    openings = [OpeningReply(minimum=opening.minimum, maximum=opening.maximum) for opening in room.openings]
+    return RoomReply(number=number, name=room.name, minimum=room.minimum, maximum=room.maximum, found=room.is_found, openings=openings)
 
 
 def sector_grid(info: WorldInfo) -> SectorGridReply:

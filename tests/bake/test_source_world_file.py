@@ -1,5 +1,6 @@
 """world.toml: what it joins, and that every wrong key is named."""
 
+from dataclasses import replace
 from datetime import date
 
 import numpy as np
@@ -70,7 +71,7 @@ def test_everything_that_the_file_says_arrives(folder):
     scene = load(folder, WORLD)
     assert scene.name == "two boxes"
     assert scene.location == Location(48.137, 11.575, 519.0, "Europe/Berlin", 29.0, date(2024, 12, 21), "given")
-    assert scene.rooms == (Room("hall", (0, 0, 0), (1, 2, 3)),)
+    assert [replace(room, openings=()) for room in scene.rooms] == [Room("hall", (0, 0, 0), (1, 2, 3))]
     assert scene.lamps == (Lamp("corner", "spot", (1, 2, 3), 800, (1, 0.5, 0.2), 12.5),)
     assert scene.decals == (Decal("taxi", (3, 0.25, 4), (1.8, 1.25, 4.6), 30),)
     assert scene.hints == (ProbeHint("forbid", (0, 0, 0), (1, 1, 1)),)
@@ -119,6 +120,9 @@ WRONG = {
     "a flat decal": (replaced("1.25, 4.6", "0, 4.6"), r"\[\[decal\]\] 1: size: expected three numbers from 0.01 to 1000"),
     "a decal nowhere": (replaced("[3, 0.25, 4]", "[3, inf, 4]"), "position: expected three numbers"),
     "a decal of a colour": (replaced("yaw_degrees = 30", "colour = 3"), r"\[\[decal\]\] 1: unknown key colour"),
+    "a search in words": (WORLD + '[rooms]\nfind = "yes"\n', r"\[rooms\]: find: expected true or false, found 'yes'"),
+    "a search for closed rooms alone": (WORLD + "[rooms]\nclosed = true\n", r"\[rooms\]: closed: expected find = true with it"),
+    "a search for more": (WORLD + "[rooms]\nfind = true\nsize = 3\n", r"\[rooms\]: unknown key size; expected find, closed"),
     "a wish": (replaced('"forbid"', '"please"'), "kind: expected add or forbid"),
     "north in words": (replaced("29.0", '"up"'), "north_degrees"),
     "no source": ("name = 'x'\n", "at least one"),

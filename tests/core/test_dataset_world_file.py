@@ -1,13 +1,16 @@
 """world.json is not trusted: whatever is in it, a dataset opens right or is refused by name, with one clear line."""
 
+import base64
 import contextlib
 import copy
 import json
 import shutil
 import sys
+import zlib
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -16,7 +19,8 @@ from bake_jobs.runner import bake
 from gi_core.dataset import MAX_WORLD_BYTES, Dataset, WorldInfo, write_world
 from gi_core.errors import CorruptFileError, FormatError, FormatVersionError, InputError, SectorlightError
 from gi_core.grid import SectorIndex
-from gi_core.world import Decal
+from gi_core.rooms import pack_cells, rooms_of
+from gi_core.world import Decal, Opening
 from server.cli import main
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "v1"
@@ -50,9 +54,9 @@ def test_what_is_written_is_what_is_read(tmp_path):
     assert world.counts["probes"] == sum(facts["probes"] for facts in RECORD["sectors"].values())
 
 
-@pytest.mark.parametrize("version", [0, 5, 999])
+@pytest.mark.parametrize("version", [0, 6, 999])
 def test_another_version_is_named_and_says_what_to_do(version):
-    with pytest.raises(FormatVersionError, match=rf"city/world\.json: dataset version {version}, .* versions 1 to 4; bake it again"):
+    with pytest.raises(FormatVersionError, match=rf"city/world\.json: dataset version {version}, .* versions 1 to 5; bake it again"):
         read(at("version", to=version))
 
 
@@ -105,6 +109,59 @@ def test_version_4_has_decals_and_no_other_has():
 def test_a_decal_that_is_no_box_is_refused_by_name(member, wrong):
     with pytest.raises(CorruptFileError, match=rf"decals.*{member}"):
         read(RECORD | {"version": 4, "sky": "faces", "decals": [DECAL | {member: wrong}]})
+
+
+RECORD_5 = json.loads((GOLDEN.parent / "v5" / "world.json").read_bytes())
+
+
+def test_version_5_has_openings_and_cells_of_rooms_and_no_other_has(tmp_path):
+    world = read(RECORD_5)
+    assert json.loads(json.dumps(world.to_json())) == RECORD_5
+    hall, found = world.rooms
+    assert (hall.is_found, hall.openings) == (False, (Opening((43.0, 0.0, 40.0), (44.0, 2.0, 40.0)),))
+    assert found.cells == pack_cells(np.argwhere(l_of_cells())[:, [2, 0, 1]] + [-128, 0, 64])
+    # Inside its box the room is an L.
+    corner = np.array([[-49.0, 1, 26], [-49, 1, 31], [-41, 1, 26], [-41, 1, 31]])
+    assert rooms_of(corner, world.rooms).tolist() == [2, 2, 2, 0]
+    # A world of authored boxes without an opening is written as what it was before there were any.
+    plain = [room | {"openings": [], "cells": None} for room in RECORD_5["rooms"][:1]]
+    assert read(RECORD_5 | {"rooms": plain, "decals": []}).version == 1
+    with pytest.raises(CorruptFileError, match="unknown"):
+        read(RECORD | {"rooms": RECORD_5["rooms"]})
+
+
+def l_of_cells():
+    air = np.ones((8, 16, 24), bool)
+    air[:, 8:, 12:] = False
+    return air
+
+
+@pytest.mark.parametrize(
+    ("place", "wrong"),
+    [
+        (("openings",), None),
+        (("openings",), [{"minimum": [0, 0, 0]}]),
+        (("openings", 0, "minimum"), [0, 0, "0"]),
+        (("cells", "first"), [0, 0]),
+        (("cells", "first"), [0, 0, 0.5]),
+        (("cells", "shape"), [0, 8, 16]),
+        (("cells", "shape"), [25, 8, 16]),
+        (("cells", "shape"), [1 << 26, 1 << 26, 1 << 26]),
+        (("cells", "bits"), "?"),
+        (("cells", "bits"), "AAAA"),
+        (("cells", "bits"), base64.b64encode(zlib.compress(bytes(1 << 20))).decode()),
+        (("cells", "bits"), base64.b64encode(zlib.compress(bytes(24 * 8 * 16 // 8))[:-4]).decode()),
+        (("cells", "colour"), 1),
+    ],
+)
+def test_a_found_room_that_is_none_is_refused_by_name(place, wrong):
+    record = copy.deepcopy(RECORD_5)
+    within = record["rooms"][1]
+    for name in place[:-1]:
+        within = within[name]
+    within[place[-1]] = wrong
+    with pytest.raises(CorruptFileError, match=rf"rooms.*{place[0]}.*; bake it again"):
+        read(record)
 
 
 def test_more_decals_than_the_limit_are_refused(monkeypatch):

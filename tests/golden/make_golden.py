@@ -23,8 +23,9 @@ from gi_core.container import write_atomic
 from gi_core.dataset import DISTANT_FILE, VERSION, Dataset, SectorFacts, WorldInfo, fine_path, geometry_path, sector_path, write_world
 from gi_core.distant_transfer import DistantTransfer
 from gi_core.grid import SectorIndex
+from gi_core.rooms import pack_cells
 from gi_core.sun_table import SunTable
-from gi_core.world import Decal, Lamp, Location, Room
+from gi_core.world import Decal, Lamp, Location, Opening, Room
 
 BAKE_ID = "0123456789abcdef0123456789abcdef"
 # Coarse enough for a few probes, and more than one feedback probe, so that their weights are stored.
@@ -71,6 +72,19 @@ def tiny_scene() -> Scene:
 def scene_v4() -> Scene:
     """The same with a decal: version 4, whatever the settings."""
     return replace(tiny_scene(), decals=(Decal("taxi", (10.0, 0.25, 12.0), (1.8, 1.25, 4.6), 30.0),))
+
+
+def scene_v5() -> Scene:
+    """The same with rooms that have openings, one of them found: an L of cells. Version 5, whatever the settings and decals."""
+    scene = scene_v4()
+    air = np.ones((8, 16, 24), bool)
+    air[:, 8:, 12:] = False
+    door = Opening((43.0, 0.0, 40.0), (44.0, 2.0, 40.0))
+    window = Opening((-50.0, 1.0, 26.0), (-50.0, 2.0, 28.0))
+    found = Room(
+        "found-1", (-50.0, 0.0, 25.0), (-40.625, 3.125, 31.25), (window,), pack_cells(np.argwhere(air)[:, [2, 0, 1]] + [-128, 0, 64])
+    )
+    return replace(scene, rooms=(replace(scene.rooms[0], openings=(door,)), found))
 
 
 def write_golden(folder: Path, settings: BakeSettings = SETTINGS, scene: Scene | None = None) -> WorldInfo:
@@ -132,4 +146,4 @@ def write_distant(target: Path) -> None:
 
 if __name__ == "__main__":
     target = Path(__file__).parent / f"v{VERSION}"
-    print(target, write_golden(target, SETTINGS, scene_v4()).counts)
+    print(target, write_golden(target, SETTINGS, scene_v5()).counts)

@@ -245,8 +245,53 @@ def test_a_header_tells_of_the_rooms_that_the_volume_reaches(http: httpx.Client,
     y, z, x = np.nonzero(mask == 2)
     centre = np.array(facts["origin"]) + 3.125 * np.stack([x, y, z], axis=1)
     reached = [r for r in rooms if ((centre >= r["minimum"]) & (centre <= r["maximum"])).all(axis=1).any()]
-    assert told == reached[:16]
+    assert told == [{name: r[name] for name in ("number", "name", "minimum", "maximum")} for r in reached[:16]]
     assert facts["rooms_reached"] == len(reached) > 0
+
+
+def solid_angle(a: Any, b: Any, c: Any) -> Any:
+    """Of triangles (n, 3) seen from the origin (van Oosterom and Strackee, 1983)."""
+    x, y, z = (np.linalg.norm(corner, axis=1) for corner in (a, b, c))
+    volume = np.abs(np.einsum("ij,ij->i", a, np.cross(b, c)))
+    dots = (np.einsum("ij,ij->i", p, q) for p, q in ((a, b), (a, c), (b, c)))
+    ab, ac, bc = dots
+    return 2 * np.arctan2(volume, x * y * z + ab * z + ac * y + bc * x)
+
+
+def test_a_weight_is_sharp_at_walls_and_smooth_through_openings(http: httpx.Client, noon: Place) -> None:
+    _, room, middle = room_in(http)
+    inside = {**noon, **dict(zip("xyz", middle.tolist(), strict=True))}
+    content, facts, _ = get(http, inside, kind="interior", weight=1)
+    weight = array(content)
+    assert (weight.shape, weight.dtype, facts["dtype"], facts["shape"]) == ((2, 64, 128, 128), np.uint8, "uint8", [2, 64, 128, 128])
+    assert get(http, inside, kind="interior", weight=1, format="raw")[0] == weight.tobytes()
+    assert facts["voxel_size"] == [0.78125] * 3
+    at = (
+        np.stack(np.meshgrid(*(np.arange(n) for n in weight.shape[1:]), indexing="ij"), axis=-1)[..., [2, 0, 1]] * 0.78125 + facts["origin"]
+    )
+    np.testing.assert_array_equal(weight[0] == 255, ((at >= room["minimum"]) & (at <= room["maximum"])).all(axis=-1))
+    assert set(np.unique(weight[0]).tolist()) == {0, 255}
+    # Of the openings, rectangles across one axis, the one that fills most of the view; corner by corner as a pair of triangles.
+    chosen = np.random.default_rng(2).choice(np.flatnonzero(weight[1].ravel() > 0), 500)
+    eye, view = at.reshape(-1, 3)[chosen], np.zeros(500)
+    for opening in room["openings"]:
+        low, high = np.array(opening["minimum"]), np.array(opening["maximum"])
+        axis = int(np.argmin(high - low))
+        assert low[axis] == high[axis]
+        nearer = eye.copy()
+        off = eye[:, axis] - low[axis]
+        nearer[:, axis] -= np.sign(off) * np.minimum(np.abs(off) - 1e-9, 0.390625)
+        corners = np.stack([low, low, high, high])
+        corners[1, (axis + 1) % 3], corners[3, (axis + 1) % 3] = high[(axis + 1) % 3], low[(axis + 1) % 3]
+        a, b, c, d = (corner - nearer for corner in corners)
+        view = np.maximum(view, (solid_angle(a, b, c) + solid_angle(a, c, d)) / (2 * np.pi))
+    np.testing.assert_allclose(weight[1].ravel()[chosen], 255 * np.clip((view - 0.25) / 0.75, 0, 1), atol=0.6)
+    assert weight[1].max() == 255
+    # mask=1 says what it always said.
+    assert set(np.unique(array(get(http, inside, kind="interior", mask=1)[0])).tolist()) <= {0, 1, 2, 3}
+    for wrong in ({"mask": 1}, {"format": "ktx2"}):
+        assert "weight with kind=interior, format=npy or raw, and no mask" in refusal(http, inside, kind="interior", weight=1, **wrong)
+    assert "weight with kind=interior" in refusal(http, inside, weight=1)
 
 
 def test_a_header_stays_small_whatever_the_world_has() -> None:

@@ -1,0 +1,171 @@
+"""Rooms that are found: what is enclosed and can be walked into is one, what the sky or the street reaches is not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bake_jobs.air_basins import find_basins
+from bake_jobs.room_search import world_rooms
+from bake_jobs.scene_source import load_scene
+from gi_core.constants import ROOM_CELL_M
+from gi_core.errors import SourceError
+from gi_core.rooms import holds, rooms_of
+from gi_core.world import Room
+
+WALL = 0.2
+DOOR, WINDOW = (1.0, 2.0), (1.4, 0.9, 2.2)  # widths [m], heads, and a sill
+
+
+def house(block, low, high, height=2.8, door=True, window=True, roof=True, along=2.0):
+    """Four walls about the inside of a box on the ground (x, z), a roof, and so far along the walls at the lowest z and x a door and a
+    window."""
+    (x0, z0), (x1, z1), h = low, high, WALL / 2
+    doors = [(along, -0.1, along + DOOR[0], DOOR[1])] if door else []
+    windows = [(along, WINDOW[1], along + WINDOW[0], WINDOW[2])] if window else []
+    block.wall((x0 - WALL, z0 - h), (x1 + WALL, z0 - h), height, doors)
+    block.wall((x0 - WALL, z1 + h), (x1 + WALL, z1 + h), height)
+    block.wall((x0 - h, z0 - WALL), (x0 - h, z1 + WALL), height, windows)
+    block.wall((x1 + h, z0 - WALL), (x1 + h, z1 + WALL), height)
+    if roof:
+        block.box((x0 - WALL, height - 0.01, z0 - WALL), (x1 + WALL, height + 0.3, z1 + WALL))
+    return block
+
+
+def found(block, search="open", **fields):
+    return world_rooms(block.scene(**fields), search)
+
+
+@pytest.fixture
+def ground(build):
+    return build().ground((-64, -64), (128, 128))
+
+
+def test_a_house_with_a_door_and_a_window_is_one_room_that_ends_at_its_walls(ground):
+    (room,) = found(house(ground, (10.3, 20.15), (18.4, 26.2)))
+    assert room.name == "found-1"
+    np.testing.assert_allclose(room.minimum, (10.3, 0, 20.15), atol=2e-3)
+    np.testing.assert_allclose(room.maximum, (18.4, 2.79, 26.2), atol=2e-3)
+    door, window = sorted(room.openings, key=lambda opening: opening.minimum[1])
+    # In the wall's inner face, from rim to rim; a door goes on below the floor as far as it is high.
+    np.testing.assert_allclose((door.minimum, door.maximum), ((12.1, -2.0, 20.15), (13.1, 2.0, 20.15)), atol=2e-3)
+    np.testing.assert_allclose((window.minimum, window.maximum), ((10.3, 0.9, 21.95), (10.3, 2.2, 23.35)), atol=2e-3)
+    rng = np.random.default_rng(1)
+    inside = rng.uniform(room.minimum, room.maximum, (2000, 3))
+    assert holds(room, inside).all()
+    outside = rng.uniform((8, 0, 18), (21, 4, 29), (2000, 3))
+    outside = outside[((outside < room.minimum) | (outside > room.maximum)).any(axis=1)]
+    assert not holds(room, outside).any()
+
+
+def test_a_house_at_an_angle_is_a_room_too(build):
+    block = build().ground((-64, -64), (64, 64))
+    turn = np.array([[np.cos(0.5), -np.sin(0.5)], [np.sin(0.5), np.cos(0.5)]])
+    corners = np.array([(0, 0), (8, 0), (8, 6), (0, 6)]) @ turn.T
+    for number in range(4):
+        block.wall(corners[number], corners[(number + 1) % 4], 2.8, [(3.0, -0.1, 4.0, 2.0)] if number == 0 else ())
+    block.box((-10, 2.79, -10), (12, 3.1, 12))  # a roof that overhangs all of it
+    (room,) = found(block)
+    rng = np.random.default_rng(2)
+    points = rng.uniform((-9, 0.1, -9), (11, 2.7, 11), (20_000, 3))
+    local = points[:, [0, 2]] @ turn
+    # Beside walls that follow no axis a room's edge is as sharp as its cells: to half the diagonal of one, and the grown wall (4 cm).
+    edge = ROOM_CELL_M * np.sqrt(0.5) + 0.04
+    low, high = np.array([0, 0]) + WALL / 2, np.array([8, 6]) - WALL / 2
+    inside = ((local > low + edge) & (local < high - edge)).all(axis=1)
+    outside = ((local < low - edge) | (local > high + edge)).any(axis=1)
+    assert holds(room, points[inside]).all()
+    assert not holds(room, points[outside]).any()
+    assert len(room.openings) >= 1
+
+
+def test_two_rooms_with_a_door_between_are_two(ground):
+    block = house(ground, (10, 20), (20, 26))
+    block.wall((15, 19.9), (15, 26.1), 2.8, [(2.0, -0.1, 3.0, 2.0)])
+    first, second = found(block)
+    assert (first.maximum[0], second.minimum[0]) == pytest.approx((14.9, 15.1), abs=2e-3)
+    # The inner door leads to no open air; only the first room has a door and a window of its own.
+    assert (len(first.openings), len(second.openings)) == (2, 0)
+
+
+def test_what_the_street_or_the_sky_reaches_is_no_room(build):
+    street = build().ground((-64, -64), (128, 128))
+    for z in (0.0, 14.0):  # a canyon, 10 m wide and 20 m high
+        street.box((0, 0, z), (60, 20, z + 4))
+    # With a gallery along one side, so that some of it is covered.
+    courtyard = house(build().ground((-64, -64), (128, 128)), (10, 20), (22, 25), height=9, roof=False).box((10, 3, 20), (22, 3.3, 22))
+    underpass = (
+        build().ground((-64, -64), (128, 128)).box((0, 0, 0), (20, 10, 10)).box((0, 0, 16), (20, 10, 26)).box((0, 4, 9), (20, 10, 17))
+    )
+    shed = house(build().ground((-64, -64), (128, 128)), (10, 20), (12, 22), window=False, along=0.6)  # 11 m3: too small for a room
+    for scene in (street, courtyard, underpass, shed):
+        assert found(scene) == ()
+
+
+@pytest.mark.parametrize(("pillar", "lintel"), [(0.6, 4.1), (1.2, 3.4), (1.6, 3.2)])
+def test_an_arcade_open_along_one_side_is_no_room(build, pillar, lintel):
+    """4 m deep and 4.1 m high, a pillar every 4 m: wide bays are one with the street, arches open too much of what is behind them."""
+    arcade = build().ground((-64, -64), (128, 128)).box((0, 0, 4), (40, 12, 14)).box((0, 4.1, 0), (40, 12, 4.1))
+    for x in np.arange(0, 41, 4.0):
+        arcade.box((x - pillar / 2, 0, 0), (x + pillar / 2, 4.2, 0.6))
+    for x in (0.0, 39.7):
+        arcade.box((x, 0, 0), (x + 0.3, 4.2, 4.1))
+    arcade.box((0, lintel, 0), (40, 4.2, 0.6))
+    assert found(arcade) == ()
+
+
+def test_a_closed_box_is_a_room_only_when_asked_for(ground):
+    block = house(ground, (10, 20), (18, 26), door=False, window=False)
+    assert found(block) == ()
+    (room,) = found(block, "all")
+    assert room.openings == ()
+    # Solid blocks have no air inside, whatever is asked for.
+    assert found(ground.box((40, 0, 40), (50, 10, 50)), "all") == (room,)
+
+
+def test_authored_rooms_win_and_come_first(ground):
+    block = house(house(ground, (10, 20), (18, 26)), (30, 20), (38, 26))
+    lobby = Room("lobby", (10.0, 0.0, 20.0), (18.0, 2.79, 26.0))
+    authored, other = found(block, rooms=(lobby,))
+    assert authored == replace(lobby, openings=authored.openings)
+    assert len(authored.openings) == 2
+    assert (other.name, other.minimum[0]) == ("found-1", pytest.approx(30.0, abs=2e-3))
+    assert found(block, "none", rooms=(lobby,)) == (authored,)
+
+
+def test_a_found_city_is_the_authored_one():
+    """The rooms of the made-up city, found with its author's list put away."""
+    scene = load_scene("procedural:midtown?blocks=1x1&seed=1")
+    rooms = world_rooms(replace(scene, rooms=()), "open")
+    known = {room.minimum: room for room in scene.rooms}
+    assert len(rooms) == len(known) > 0
+    for room in rooms:
+        nearest = min(known, key=lambda low: np.abs(np.subtract(low, room.minimum)).max())
+        np.testing.assert_allclose(room.minimum, nearest, atol=2e-3)
+        np.testing.assert_allclose(room.maximum, known[nearest].maximum, atol=2e-3)
+        assert len(room.openings) == len(known[nearest].openings)
+    np.testing.assert_array_equal(rooms_of(np.array([room.minimum for room in rooms]) + 1, rooms), np.arange(1, len(rooms) + 1))
+
+
+def test_too_large_a_piece_of_covered_air_is_refused_by_name(ground, monkeypatch):
+    monkeypatch.setattr("bake_jobs.room_search.MAX_REGION_CELLS", 10_000)
+    with pytest.raises(SourceError, match=r"\[rooms\] find: expected covered air in parts of at most 596 m3, found one of \d+ m3"):
+        found(house(ground, (10, 20), (18, 26)))
+
+
+def test_air_is_cut_where_it_is_narrow_and_nowhere_else():
+    air = np.zeros((9, 24, 40), bool)
+    air[1:8, 2:22, 2:18] = air[1:8, 2:22, 19:38] = True
+    assert np.unique(find_basins(air)).tolist() == [0, 1, 2]
+    air[1:6, 10:13, 18] = True  # a door
+    basins = find_basins(air)
+    assert np.unique(basins).tolist() == [0, 1, 2]
+    assert set(np.unique(basins[1:8, 2:22, 2:17])) == {1}
+    assert set(np.unique(basins[1:8, 2:22, 20:38])) == {2}
+    air[1:8, 5:20, 18] = True  # as good as no wall
+    assert np.unique(find_basins(air)).tolist() == [0, 1]
+    high = np.zeros((13, 24, 40), bool)
+    high[1:12, 2:22, 2:18] = high[1:12, 2:22, 19:38] = high[1:11, 5:20, 18] = True  # under a beam
+    assert np.unique(find_basins(high)).tolist() == [0, 1]
+    assert np.unique(find_basins(np.ones((4, 5, 6), bool))).tolist() == [1]
+    assert not find_basins(np.zeros((4, 5, 6), bool)).any()
