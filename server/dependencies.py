@@ -172,6 +172,7 @@ class PreviewQuery(LightingQuery):
         "on", description="off: direct light only; split: left off, right on; error: against a path tracer, in false colour"
     )
     distant: Beyond = Field("on", description="beyond the volumes: the distant texture, or off; client: beyond the eye's one volume")
+    interior: Literal["on", "off"] = Field("on", description="off: rooms are lit by the outdoor volume, as without interior ones")
     ao: Literal["on", "off"] = Field("off", description="on: what stands within 3 m, and decals, dim indirect light")
     view: Literal["lit"] | ViewName = Field("lit", description="what lies behind the picture, in false colours or as spheres")
 

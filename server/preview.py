@@ -43,11 +43,13 @@ class Look:
     indirect : where indirect light is drawn; split: in the right half only
     distant : what lies beyond the volumes; on: the distant texture, off: the nearest volume's edge, client: the texture beyond the one
         volume around the eye
+    interior : whether rooms are lit by their interior volumes, or by the outdoor one
     """
 
     indirect: Indirect = "on"
     distant: Beyond = "on"
     occlusion: bool = False
+    interior: bool = True
 
 
 PLAIN_LOOK = Look()
@@ -57,7 +59,7 @@ def city_radiance(
     engine: Engine, scene: PreviewScene, camera: Camera, lighting: Lighting, look: Look = PLAIN_LOOK, settings: Settings = NEUTRAL
 ) -> Float32:
     """``render`` with an engine's lamps and light, under the artists' settings. Raises CorruptFileError."""
-    served = ServedLight.of(engine, lighting, settings, look.distant, camera.eye)
+    served = ServedLight.of(engine, lighting, settings, look.distant, camera.eye, look.interior)
     lamps = settings.brightened(lamps_on(engine.lamps, lighting))
     return render(camera, scene, settings.light(lighting), lamps, served, look)
 

@@ -67,8 +67,11 @@ class ServedLight:
     decals: tuple[Decal, ...] = ()
 
     @classmethod
-    def of(cls, engine: Engine, lighting: Lighting, settings: Settings, beyond: Beyond, eye: Float64) -> "ServedLight":
-        """An engine's light under the artists' settings, seen from an eye (3,) [m]. Raises CorruptFileError."""
+    def of(
+        cls, engine: Engine, lighting: Lighting, settings: Settings, beyond: Beyond, eye: Float64, interior: bool = True
+    ) -> "ServedLight":
+        """An engine's light under the artists' settings, seen from an eye (3,) [m]. Without ``interior`` volumes rooms are lit by the
+        outdoor one. Raises CorruptFileError."""
         low, high = engine.dataset.world.bounds
 
         def volume_at(position: Float64, room: int) -> Volume:
@@ -80,7 +83,8 @@ class ServedLight:
                 return engine.volume(inside, lighting, settings)
 
         distant = None if beyond == "off" else engine.distant(settings.light(lighting))
-        return cls(volume_at, distant, eye if beyond == "client" else None, engine.dataset.world.rooms, engine.dataset.world.decals)
+        world = engine.dataset.world
+        return cls(volume_at, distant, eye if beyond == "client" else None, world.rooms if interior else (), world.decals)
 
     def irradiance(self, position: Float64, normal: Float32) -> Float32:
         """(n, 3) [lx] on surface points (n, 3) [m] with normals (n, 3), as a client samples it."""

@@ -8,6 +8,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+from PIL import Image
 
 from gi_core.constants import VOLUME_SHAPE
 from gi_core.volume import Volume
@@ -347,3 +348,12 @@ def test_the_sky_as_openexr_opens_in_openexr(http: httpx.Client, tmp_path: Any) 
     channels = openexr.File(str(path)).channels()
     picture = channels["RGB"].pixels if "RGB" in channels else np.stack([channels[c].pixels for c in "RGB"], axis=2)
     np.testing.assert_array_equal(picture, array(http.get("/v1/sky", params=query).content))
+
+
+def test_a_picture_shows_a_room_without_its_interior_volume(http: httpx.Client, noon: Place) -> None:
+    """The street's light at noon, which the walls keep out."""
+    _, _, middle = room_in(http)
+    look = {"eye": ",".join(map(str, middle)), "look": ",".join(map(str, middle - (1.0, 0.3, 0.0))), "width": 64}
+    look |= {"time": noon["time"], "weather": noon["weather"]}
+    with_it, without = (Image.open(io.BytesIO(http.get("/v1/preview.png", params=look | {"interior": on}).content)) for on in ("on", "off"))
+    assert np.asarray(without).mean() > 1.5 * np.asarray(with_it).mean() > 0
