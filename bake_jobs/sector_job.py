@@ -95,8 +95,10 @@ class SectorBaker:
             interpolation = meta.get("estimated_error", 0.0)
             measured = self._served_error.of(sector, search.judged) or 0.0
             own = float(np.sqrt(max(measured**2 - interpolation**2, 0.0)))
+            if left == 0 or measured <= self._settings.target_error:
+                break
             before, count = count, search.probes(own)
-            if left == 0 or count == before or measured <= self._settings.target_error:
+            if count == before:
                 break
         if "estimated_error" in meta:
             meta["estimated_error"], meta["own_error"] = round(max(measured, interpolation), 5), round(own, 5)
