@@ -21,6 +21,14 @@
 #define SHADOW_BIAS_CELLS 0.05f
 #define SHADOW_TAPS 4
 #define SHADOW_ROW_TEXELS 1040
+#define PER_DIRECTION_STEP 0.0625f
+#define LONGEST_SQUARED 1.5625f
+#define FACE_GAIN 0.7111111111111111f
+#define WEIGHT_MEAN 3.544907701811032f
+#define WEIGHT_LINEAR 4.093306831785955f
+#define WEIGHT_PRODUCT 3.4323421232391347f
+#define WEIGHT_ZENITH 0.9908318244015029f
+#define WEIGHT_DIFFERENCE 1.7161710616195673f
 
 // How much of one row of the probes' light a brick sends on, per channel. row : ROW_ONE + probe * coefficients, and of the cube + face.
 typedef struct {

@@ -1,4 +1,6 @@
-"""Writes tests/golden/v<version>: a dataset of two sectors, small enough to keep, that has every array of the format.
+"""Writes tests/golden/v<version>_sector<version>: datasets of two sectors, small enough to keep, that have every array of the format.
+
+The versions are those of world.json and of sector files; folders without the latter have sector files of version 1.
 
     python tests/golden/make_golden.py
 
@@ -17,7 +19,7 @@ from bake_jobs.geometry_clip import SectorCutter
 from bake_jobs.scene import Mesh, Scene, join_meshes
 from bake_jobs.sector_job import SectorBaker
 from bake_jobs.solids import boxes
-from gi_core import distant_file
+from gi_core import distant_file, sector_file
 from gi_core.container import write_atomic
 from gi_core.dataset import DISTANT_FILE, VERSION, SectorFacts, WorldInfo, fine_path, geometry_path, sector_path, write_world
 from gi_core.grid import SectorIndex
@@ -114,6 +116,12 @@ def write_golden(folder: Path, settings: BakeSettings = SETTINGS, scene: Scene |
     return world
 
 
+# Of the cube and of harmonics, whose sector files have other arrays.
+WRITTEN = {
+    f"v{VERSION}_sector{sector_file.VERSION}": (SETTINGS, scene_v4()),
+    f"v2_sector{sector_file.VERSION}": (SETTINGS_V2, tiny_scene()),
+}
+
 if __name__ == "__main__":
-    target = Path(__file__).parent / f"v{VERSION}"
-    print(target, write_golden(target, SETTINGS, scene_v4()).counts)
+    for name, (settings, scene) in WRITTEN.items():
+        print(name, write_golden(Path(__file__).parent / name, settings, scene).counts)
