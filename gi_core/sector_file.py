@@ -38,6 +38,8 @@ _RENAMED = {
     "surfel_position": "surfel_in_cell",
 }
 _ARRAYS = frozenset(_RENAMED.get(f.name, f.name) for f in fields(Sector)) - {"index", "voxel_first"} | {"factor_direction", "voxel_list"}
+_IN_HARMONICS = frozenset({"factor_direction", "factor_trim"})
+_SINCE_2 = frozenset({"voxel_list"})
 
 
 def encode(sector: Sector, meta: dict[str, Any], sky_patches: int) -> bytes:
@@ -133,7 +135,8 @@ def _surfel_cells(brick_cell: AnyArray, brick_level: AnyArray, brick_starts: Any
 
 def _sector(found: Container) -> Sector:
     take = found.take
-    found.refuse_unknown(_META, _ARRAYS)
+    absent = _IN_HARMONICS if "factor_trim" not in found.arrays or found.version == 1 else frozenset()
+    found.refuse_unknown(_META, _ARRAYS - absent - (_SINCE_2 if found.version == 1 else frozenset()))
     factor_starts, brick_starts = starts(take("factor_count", "u2", 1)), starts(take("brick_count", "u2", 1))
     brick_cell = np.ascontiguousarray(take("brick_cell", "i4", 2).T)
     brick_level = take("brick_level", "u1", 1)
