@@ -62,7 +62,7 @@ def work(resident: ResidentSector, to_sun: np.ndarray[tuple[int, ...], np.dtype[
         "light_bricks": (surfels * (16 + 4) + bricks * (4 + 16 + 16), surfels * 16 + bricks * 9),
         "bounce_bricks": (16 * bounces + bricks * (4 + 16 + 16) + 2 * 16 * SKY_PATCHES + cubes, 6 * bounces),
         "gather_probes": (
-            sector.factor_count * (4 + sector.factor_code.shape[1]) + 16 * (bricks + SKY_PATCHES) + probes * (8 + 8 * basis) + cubes,
+            sector.factor_count * (4 + basis) + 16 * (bricks + SKY_PATCHES) + probes * (8 + 8 * basis) + cubes,
             sector.factor_count * 7 * basis,
         ),
     }

@@ -7,6 +7,7 @@ four codes, of the first harmonic's root and of that direction (y, z, x), from w
 
     share[0] = (code[0] / 127) ** 2 * scale[p, k]               m = code[1:] / 16,  r = m . m,  g = r, or 32 / 45 of a face of the sky
     share[b] = share[0] * (gain[b] * polynomial[b] + trim[p, k, b])         gain: 2 for y z x; 15/4 g for xy yz xz, and so on
+    (the products of share[0] and polynomials rounded to codes of a byte, ``expanded``, which is what kernels read)
     weight   = share / basis.factor_shares
 
 A shorter mean direction is a wider patch, and the second band fades with the square of the first (r). ``trim`` is what this lacks in
@@ -15,6 +16,7 @@ is a sky patch: a probe's brick factors come before its sky's, so that a sum of 
 """
 
 from collections.abc import Callable
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -80,9 +82,11 @@ def decode(codes: Codes, factor_starts: AnyArray, sky_starts: AnyArray) -> Float
     return np.asarray(shares / factor_shares(basis_of_size(basis)).astype(np.float32), np.float32)
 
 
-def device_code(code: AnyArray) -> UInt8:
-    """Codes as gather_probes.cl reads them: of harmonics plus 128."""
-    return code if code.dtype == np.uint8 else code.view(np.uint8) ^ np.uint8(128)
+def device_code(codes: Codes) -> UInt8:
+    """(F, B) codes as gather_probes.cl reads them: of harmonics one for each, plus 128. To work them out there took half as long again."""
+    if codes.factor_trim is None:
+        return codes.factor_code.view(np.uint8)
+    return expanded(codes.factor_code, 1 + codes.factor_trim.shape[2]).view(np.uint8) ^ np.uint8(128)
 
 
 def device_scale(codes: Codes) -> Float32:
@@ -141,14 +145,39 @@ def _encode_direction(mean: AnyArray) -> Int8:
 
 def _harmonic_shares(code: AnyArray, basis: int) -> Float32:
     """Codes (F, 4) -> shares (F, basis) float32, without scale and trim."""
-    share = quantise.decode_signed_root(code[:, 0])
-    y, z, x = (code[:, k].astype(np.float32) / np.float32(DIRECTION_STEPS) for k in (1, 2, 3))
-    polynomials = [np.ones_like(x), y, z, x]
-    if basis > HARMONIC_CODES:
-        r = x * x + y * y + z * z
-        g = np.where(r > np.float32(LONGEST_STEPS**2 / DIRECTION_STEPS**2), np.float32(FACE_GAIN), r)
-        polynomials += [g * (x * y), g * (y * z), g * (3 * z * z - r), g * (x * z), g * (x * x - y * y)]
-    return np.stack([share * p * np.float32(gain) for p, gain in zip(polynomials, GAINS[:basis].tolist(), strict=True)], axis=1)
+    return np.asarray(quantise.decode_signed_root(expanded(code, basis)) * AMPLITUDES[:basis].astype(np.float32), np.float32)
+
+
+def _polynomials(direction: Float64) -> Float64:
+    """(n, 3) y, z, x -> (n, 9): what shares are of the first one, as the module's docstring says it."""
+    y, z, x = direction.T
+    r = y * y + z * z + x * x
+    g = np.where(r > (LONGEST_STEPS / DIRECTION_STEPS) ** 2, FACE_GAIN, r)
+    bands = [np.ones_like(x), y, z, x, g * (x * y), g * (y * z), g * (3 * z * z - r), g * (x * z), g * (x * x - y * y)]
+    return np.stack(bands, axis=1) * GAINS
+
+
+# The most of each that a code of 127 stands for, of the first one's square. Faces of the sky have three in the first band.
+AMPLITUDES: Float64 = np.array([1, 3, 3, 3, 2, 2, 1, 2, 1.5])
+
+
+@cache
+def _roots_of_directions() -> Int8:
+    """(49 ** 3, 8): by y, z and x from -24 to 24 steps, 127 times the signed root of each other share over its amplitude."""
+    steps = np.arange(-FACE_STEPS, FACE_STEPS + 1) / DIRECTION_STEPS
+    direction = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=3).reshape(-1, 3)
+    return quantise.encode_signed_root(_polynomials(direction)[:, 1:] / AMPLITUDES[1:])
+
+
+def expanded(code: AnyArray, basis: int) -> Int8:
+    """Codes (F, 4) -> codes (F, basis) int8, one of each harmonic: the first, and that times the root of what its direction makes of it."""
+    edge, offset = 2 * FACE_STEPS + 1, FACE_STEPS
+    y, z, x = (code[:, k].astype(np.int32) + offset for k in (1, 2, 3))
+    roots = _roots_of_directions()[(y * edge + z) * edge + x, : basis - 1]
+    found = np.empty((len(code), basis), np.int8)
+    found[:, 0] = code[:, 0]
+    found[:, 1:] = np.rint(roots * (code[:, :1].astype(np.float32) / np.float32(127)))
+    return found
 
 
 def _probe_of_factor(factor_starts: AnyArray) -> Int64:

@@ -13,7 +13,7 @@ import numpy as np
 
 from gi_core.basis import SH_NORM
 from gi_core.constants import SNOW_ALBEDO
-from gi_core.factor_weights import DIRECTION_STEPS, FACE_GAIN, GAINS, LONGEST_STEPS
+from gi_core.factor_weights import AMPLITUDES
 
 # The sun and the moon.
 MAX_DIRECTIONAL_LIGHTS = 2
@@ -45,12 +45,8 @@ SHADOW_TAPS = 4
 # Floats from one row of the map to the next: 64 bytes more than the 1024 texels, so that texels under one another do not all compete for
 # the same places of a cache.
 SHADOW_ROW_TEXELS = 1040
-# Of harmonics' factor weights (gi_core.factor_weights): the steps of a unit vector; the square of a length that only faces of the sky
-# exceed, and what those have in its place; and what makes a weight of the mean's share, and of those of y z x, of products, of
-# 3 z^2 - r and of x^2 - y^2.
-PER_DIRECTION_STEP = 1 / DIRECTION_STEPS
-LONGEST_SQUARED = (LONGEST_STEPS / DIRECTION_STEPS) ** 2
-WEIGHT_MEAN, WEIGHT_LINEAR, WEIGHT_PRODUCT, WEIGHT_ZENITH, WEIGHT_DIFFERENCE = (float(GAINS[b] / SH_NORM[b]) for b in (0, 1, 4, 6, 8))
+# What makes weights of squares of harmonics' codes, beside a probe's scale (gi_core.factor_weights).
+HARMONIC_SQUARES = (AMPLITUDES / SH_NORM).tolist()
 
 _SCALARS = {"float": "f4", "uint": "u4", "int": "i4"}
 
@@ -199,14 +195,7 @@ CONSTANTS: dict[str, int | float] = {
     "SHADOW_BIAS_CELLS": SHADOW_BIAS_CELLS,
     "SHADOW_TAPS": SHADOW_TAPS,
     "SHADOW_ROW_TEXELS": SHADOW_ROW_TEXELS,
-    "PER_DIRECTION_STEP": PER_DIRECTION_STEP,
-    "LONGEST_SQUARED": LONGEST_SQUARED,
-    "FACE_GAIN": FACE_GAIN,
-    "WEIGHT_MEAN": WEIGHT_MEAN,
-    "WEIGHT_LINEAR": WEIGHT_LINEAR,
-    "WEIGHT_PRODUCT": WEIGHT_PRODUCT,
-    "WEIGHT_ZENITH": WEIGHT_ZENITH,
-    "WEIGHT_DIFFERENCE": WEIGHT_DIFFERENCE,
+    **{f"SQUARE_{b}": value for b, value in enumerate(HARMONIC_SQUARES)},
 }
 
 

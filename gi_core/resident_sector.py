@@ -66,7 +66,7 @@ class ResidentSector:
         self.factor_starts = device.upload(sector.factor_starts)
         self.factor_source = device.upload(sector.factor_source)
         self.sky_starts = device.upload(sector.sky_starts)
-        self.factor_code = device.upload(padded(factor_weights.device_code(sector.factor_code)))
+        self.factor_code = device.upload(padded(factor_weights.device_code(sector.factor_codes)))
         self.factor_scale = device.upload(padded(factor_weights.device_scale(sector.factor_codes)))
         self.voxel_probe, self.voxel_weight = (device.upload(values) for values in outdoor_blend(sector))
         self.cubes = device.allocate(sector.probe_count * sector.basis_size * 16)

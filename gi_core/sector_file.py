@@ -208,10 +208,10 @@ def _codes(found: Container, probe_position: AnyArray, centres: Callable[[], Flo
     if not 1 <= patches <= MAX_SKY_PATCHES:
         raise CorruptFileError(f"expected 1 to {MAX_SKY_PATCHES} sky patches, got {patches}")
     expected = expected_directions(probe_position, centres(), factor_starts, source, patches)
-    code = container.interleaved(np.concatenate([weight, expected]))
-    code[:, 1:] += difference  # wraps
+    for row, column in zip(expected, difference.T, strict=True):
+        row += column  # wraps
     trim = np.ascontiguousarray(np.moveaxis(found.take("factor_trim", "i1", 3), 2, 0))
-    return Codes(code, scale, trim)
+    return Codes(container.interleaved(np.concatenate([weight, expected])), scale, trim)
 
 
 def _words(octets: AnyArray) -> AnyArray:

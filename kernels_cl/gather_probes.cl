@@ -7,66 +7,62 @@
 // input gives the same bits.
 //
 // The sums are kept by channel: a weight vector times a scalar is one instruction for eight coefficients, where a colour times a scalar
-// is one for three. Weights are read as they are stored (gi_core/factor_weights.py), a byte each, of which floats would be four times as
-// much to read: of the cube a root for each face, of harmonics the root and the mean direction, four bytes for nine weights. Signed bytes come
-// plus 128, since PoCL turns them into floats one by one. Bricks and sky have scales of their own, by which their sums are multiplied.
-// The cube's codes lie as tightly as they can: a vector's last components are then the next factor's first, whose sums nobody reads, and
-// behind the last factor lies padding. A ninth coefficient would need a whole vector more for each channel, so it is kept apart, as a colour.
+// is one for three. Weights are read as they are stored (gi_core/factor_weights.py), a byte each: the root, of harmonics the root and its
+// sign plus 128, since PoCL turns signed bytes into floats one by one. Floats would be four times as much to read. Bricks and sky have
+// scales of their own, by which their sums are multiplied.
+// Codes lie as tightly as they can: a vector's last components are then the next factor's first, whose sums nobody reads, and behind the
+// last factor lies padding. A ninth coefficient would need a whole vector more for each channel, so it is kept apart, as a colour.
 //
 // Defines: BASIS_SIZE, coefficients per channel: 4, 6 (the ambient cube, whose codes have no sign) or 9.
 #ifndef BASIS_SIZE
 #error "BASIS_SIZE is not defined"
 #endif
 #include "layout.h"
+#if BASIS_SIZE == 4
+#define PER_SQUARE (float4)(SQUARE_0, SQUARE_1, SQUARE_2, SQUARE_3)
+#elif BASIS_SIZE == 9
+#define PER_SQUARE (float8)(SQUARE_0, SQUARE_1, SQUARE_2, SQUARE_3, SQUARE_4, SQUARE_5, SQUARE_6, SQUARE_7)
+#endif
 
 #if BASIS_SIZE == 4
 typedef float4 weights_t;
+typedef uchar4 codes_t;
+#define ROOTS(codes) (convert_float4(codes) - 128.0f)
+#define MAGNITUDES(roots) as_float4(as_uint4(roots) & 0x7fffffffu)
+#elif BASIS_SIZE == 6
+typedef float8 weights_t;
+typedef uchar8 codes_t;
+#define ROOTS(codes) convert_float8(codes)
+#define MAGNITUDES(roots) roots
 #else
 typedef float8 weights_t;
+typedef uchar8 codes_t;
+#define ROOTS(codes) (convert_float8(codes) - 128.0f)
+#define MAGNITUDES(roots) as_float8(as_uint8(roots) & 0x7fffffffu)
 #endif
-// A probe's scales start wherever the last one's end, and so do the cube's codes.
+// A factor's codes start wherever the last one's end, and so do a probe's scales.
+typedef codes_t loose_codes_t __attribute__((aligned(1)));
 typedef weights_t loose_weights_t __attribute__((aligned(4)));
 #define IN_VECTOR (BASIS_SIZE == 9 ? 8 : BASIS_SIZE)
 
-#if BASIS_SIZE == 6
-typedef uchar8 loose_codes_t __attribute__((aligned(1)));
-#define READ_WEIGHT(f)                                                                                            \
-    const weights_t roots = convert_float8(*(__global const loose_codes_t *)(factor_code + (f) * BASIS_SIZE));    \
-    const weights_t weight = roots * roots;
-#define ADD_LAST(source, last)
+#if BASIS_SIZE == 9
+#define ADD_LAST(f, source, last)                                                                                 \
+    {                                                                                                             \
+        const float root = (float)factor_code[(f) * BASIS_SIZE + 8] - 128.0f;                                     \
+        last += root * as_float(as_uint(root) & 0x7fffffffu) * *(__global const float4 *)source;                  \
+    }
 #else
-// Root, y, z, x.
-#define READ_CODES(f)                                                                                             \
-    const float4 codes = convert_float4(*(__global const uchar4 *)(factor_code + 4 * (f))) - 128.0f;              \
-    const float4 direction = codes * PER_DIRECTION_STEP;                                                          \
-    const float share = codes.x * codes.x, y = direction.y, z = direction.z, x = direction.w;
-#if BASIS_SIZE == 4
-#define READ_WEIGHT(f)                                                                                            \
-    READ_CODES(f)                                                                                                 \
-    const weights_t weight = share * (float4)(1.0f, y, z, x);
-#define PER_SHARE (float4)(WEIGHT_MEAN, WEIGHT_LINEAR, WEIGHT_LINEAR, WEIGHT_LINEAR)
-#define ADD_LAST(source, last)
-#else
-#define READ_WEIGHT(f)                                                                                            \
-    READ_CODES(f)                                                                                                 \
-    const float squared = x * x + y * y + z * z;                                                                  \
-    const float second = share * (squared > LONGEST_SQUARED ? FACE_GAIN : squared);                                   \
-    const weights_t weight = (float8)(share, share, share, share, second, second, second, second) *               \
-        (float8)(1.0f, y, z, x, x * y, y * z, 3.0f * z * z - squared, x * z);
-#define PER_SHARE                                                                                                 \
-    (float8)(WEIGHT_MEAN, WEIGHT_LINEAR, WEIGHT_LINEAR, WEIGHT_LINEAR, WEIGHT_PRODUCT, WEIGHT_PRODUCT, WEIGHT_ZENITH, WEIGHT_PRODUCT)
-#define ADD_LAST(source, last) last += second * (x * x - y * y) * *(__global const float4 *)source;
+#define ADD_LAST(f, source, last)
 #endif
-#endif
-
 #define ADD_FACTOR(f, red, green, blue, last)                                                                     \
     {                                                                                                             \
         __global const float *source = (__global const float *)(exitance + factor_source[f]);                     \
-        READ_WEIGHT(f)                                                                                            \
+        const weights_t roots = ROOTS(*(__global const loose_codes_t *)(factor_code + (f) * BASIS_SIZE));         \
+        const weights_t weight = roots * MAGNITUDES(roots);                                                       \
         red += weight * source[0];                                                                                \
         green += weight * source[1];                                                                              \
         blue += weight * source[2];                                                                               \
-        ADD_LAST(source, last)                                                                                    \
+        ADD_LAST(f, source, last)                                                                                 \
     }
 
 inline void gather_probe(
@@ -108,14 +104,14 @@ inline void gather_probe(
         all_green += scale * green;
         all_blue += scale * blue;
 #else
-        const weights_t per_share = scales[0] * PER_SHARE;
-        scale.s0 = 0.0f; // the others are trims: so much more for each share of the first harmonic
-        all_red += per_share * red + scale * red.s0;
-        all_green += per_share * green + scale * green.s0;
-        all_blue += per_share * blue + scale * blue.s0;
+        const weights_t per_square = scales[0] * PER_SQUARE;
+        scale.s0 = 0.0f; // the others are trims: so much more for each square of the first code
+        all_red += per_square * red + scale * red.s0;
+        all_green += per_square * green + scale * green.s0;
+        all_blue += per_square * blue + scale * blue.s0;
 #endif
 #if BASIS_SIZE == 9
-        all_last += scales[0] * WEIGHT_DIFFERENCE * (last + odd_last) + scales[8] * (float4)(red.s0, green.s0, blue.s0, 0.0f);
+        all_last += scales[0] * SQUARE_8 * (last + odd_last) + scales[8] * (float4)(red.s0, green.s0, blue.s0, 0.0f);
 #endif
     }
     // Private arrays of floats: the one way to index a vector by a variable.

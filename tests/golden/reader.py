@@ -119,17 +119,17 @@ def harmonic_weights(meta: dict[str, Any], a: Arrays) -> np.ndarray:
             y, z, x = (steps[f] / 16).tolist()
             r = x * x + y * y + z * z
             g = r if r <= 1.5625 else 32 / 45
-            of_direction = [2 * y, 2 * z, 2 * x]
-            of_direction += [
-                15 / 4 * g * x * y,
-                15 / 4 * g * y * z,
-                5 / 16 * g * (3 * z * z - r),
-                15 / 4 * g * x * z,
-                15 / 16 * g * (x * x - y * y),
+            second = [15 / 4 * x * y, 15 / 4 * y * z, 5 / 16 * (3 * z * z - r), 15 / 4 * x * z, 15 / 16 * (x * x - y * y)]
+            of_direction = np.array([2 * y, 2 * z, 2 * x, *(g * s for s in second)])[: basis - 1]
+            most = np.array([3, 3, 3, 2, 2, 1, 2, 1.5])[: basis - 1]
+            roots = np.sign(of_direction) * np.rint(127 * np.sqrt(np.minimum(np.abs(of_direction) / most, 1)))
+            first = int(a["factor_weight"][0, f])
+            codes = np.rint(first * roots / 127)
+            shares_of_first = [
+                signed_root(first),
+                *(most * signed_root(codes) + signed_root(first) * signed_root(a["factor_trim"][kind, :, probe])),
             ]
-            trim = signed_root(a["factor_trim"][kind, :, probe])
-            share = signed_root(a["factor_weight"][0, f]) * np.float64(a["factor_scale"][kind, 0, probe])
-            weight[f] = share * np.array([1, *(np.array(of_direction[: basis - 1]) + trim)]) / harmonic_norms()[:basis]
+            weight[f] = np.array(shares_of_first) * np.float64(a["factor_scale"][kind, 0, probe]) / harmonic_norms()[:basis]
     return weight
 
 

@@ -27,7 +27,7 @@ DIGESTS = {
     "v1": "f6b367f763c6b74747559c79e7d8c404",
     "v3": "2283c2edeaed38157e15ce4f9a3bd682",
     "v4": "58c4bbdb83e26e00b45ed30d40b407d8",
-    "v2_sector2": "1a7f43851e380c215d112d5c207d59a9",
+    "v2_sector2": "d4e9deba8154c6fa0b66c46e0e8ecf95",
     "v4_sector2": "286608a0e21588e0ffdf44fac39a4619",
 }
 # Sector files of version 1 in harmonics.
