@@ -115,7 +115,7 @@ class SectorBaker:
         feedback_probe, feedback_weight = surfels.feedback(clustered, seen, settings.feedback_probes)
         lattice = voxels.bake_voxels(rays, self._solids, _surfaces(geometry), index, placed, settings, scene.rooms, trial)
         emits = bool(clustered.emission.any())
-        factor_code, factor_scale = factor_weights.encode(weights.weight, weights.starts, weights.source >= len(clustered.brick_cell))
+        codes = factor_weights.encode(weights.weight, weights.starts, weights.source >= len(clustered.brick_cell))
         sector = Sector(
             index=index,
             probe_position=(placed.position - index.origin).astype(np.float32),
@@ -123,8 +123,7 @@ class SectorBaker:
             probe_room=placed.room,
             factor_starts=weights.starts,
             factor_source=weights.source,
-            factor_code=factor_code,
-            factor_scale=factor_scale,
+            **codes._asdict(),
             brick_starts=clustered.brick_starts.astype(np.uint32),
             brick_level=clustered.brick_level,
             brick_cell=clustered.brick_cell,

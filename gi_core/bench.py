@@ -94,7 +94,7 @@ def talk_size_sector(seed: int, probes: int = TALK_PROBES, surfels: int = TALK_S
     weight /= weight.reshape(probes, per_probe, 6).sum(axis=1).repeat(per_probe, axis=0)
     factor_starts = starts(np.full(probes, per_probe))
     source = np.concatenate([np.sort(near, axis=1), sky], axis=1).reshape(-1).astype(np.uint32)
-    factor_code, factor_scale = factor_weights.encode(weight, factor_starts, source >= bricks)
+    codes = factor_weights.encode(weight, factor_starts, source >= bricks)
     shape = (16, 20, 20)
     return Sector(
         index=SectorIndex(0, 0),
@@ -103,8 +103,7 @@ def talk_size_sector(seed: int, probes: int = TALK_PROBES, surfels: int = TALK_S
         probe_room=np.zeros(probes, np.uint16),
         factor_starts=factor_starts,
         factor_source=source,
-        factor_code=factor_code,
-        factor_scale=factor_scale,
+        **codes._asdict(),
         brick_starts=starts(brick_sizes),
         brick_level=np.zeros(bricks, np.uint8),
         brick_cell=cell.astype(np.int32),

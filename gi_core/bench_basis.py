@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from gi_core import factor_weights
-from gi_core.basis import conversion, factor_shares, served_from
+from gi_core.basis import conversion, projection_weights, served_from
 from gi_core.bench import ROTATION, SKY_PATCHES, Measurement, daylight, side_by_side, talk_size_sector
 from gi_core.constants import BASIS_SIZES, VOLUME_SHAPE
 from gi_core.device import Device
@@ -33,10 +33,11 @@ def sector_in(basis: str, seed: int, feedback: int = 1) -> Sector:
     sector = replace(sector, feedback_probe=nearby.astype(np.uint16), feedback_weight=shares.astype(np.float32))
     if basis == "cube":
         return sector
-    magnitude = rng.uniform(0, 1, (sector.factor_count, BASIS_SIZES[basis])) * sector.factor_weight.mean(axis=1, keepdims=True)
-    signed = magnitude * rng.choice([-1.0, 1.0], magnitude.shape) / factor_shares(basis)
-    code, scale = factor_weights.encode(signed, sector.factor_starts, sector.factor_source >= sector.brick_count)
-    return replace(sector, factor_code=code, factor_scale=scale)
+    towards = rng.normal(size=(sector.factor_count, 3))
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    weight = projection_weights(basis, towards) * sector.factor_weight.mean(axis=1, keepdims=True)
+    codes = factor_weights.encode(weight, sector.factor_starts, sector.factor_source >= sector.brick_count)
+    return replace(sector, **codes._asdict())
 
 
 def bench_tick(device: Device, basis: str, feedback: int, rounds: int) -> Measurement:

@@ -30,8 +30,8 @@ MAX_RAW_BYTES = 1 << 28
 MAX_HEADER_BYTES = 1 << 20
 MAX_ARRAYS = 64
 MAX_FILE_BYTES = PREFIX_BYTES + MAX_HEADER_BYTES + MAX_RAW_BYTES
-# Higher levels save 3 % more and take three times as long.
-ZSTD_LEVEL = 12
+# 4 % less than level 12 for 0.1 s of a sector's bake; 19 saves 1 % more and takes twice as long.
+ZSTD_LEVEL = 16
 
 
 @dataclass(frozen=True)
@@ -79,8 +79,8 @@ def encode(kind: str, version: int, meta: dict[str, Any], arrays: dict[str, AnyA
     return prefix[:_DIGEST_OFFSET] + digest + prefix[_DIGEST_OFFSET + 16 :] + header + payload
 
 
-def decode(data: bytes, kind: str, version: int, where: str, oldest: int | None = None) -> Container:
-    """Contents of a container's bytes, of a version or one back to ``oldest``; ``where`` names the file in errors.
+def decode(data: bytes, kind: str, version: int | tuple[int, ...], where: str) -> Container:
+    """Contents of a container's bytes, of that version or one of those; ``where`` names the file in errors.
 
     Raises FormatVersionError for another kind or version, CorruptFileError for anything that does not fit together.
     """
@@ -89,10 +89,11 @@ def decode(data: bytes, kind: str, version: int, where: str, oldest: int | None 
     magic, found_kind, found_version, header_bytes, _, payload_bytes, raw_bytes, digest = _PREFIX.unpack_from(data)
     if magic != MAGIC or found_kind != kind.encode():
         raise CorruptFileError(f"{where}: not a Sectorlight {kind} file (it starts with {data[:12]!r})")
-    if not (version if oldest is None else oldest) <= found_version <= version:
-        known = f"version {version}" if oldest is None else f"versions {oldest} to {version}"
+    versions = (version,) if isinstance(version, int) else version
+    if found_version not in versions:
+        known = " or ".join(map(str, versions))
         raise FormatVersionError(
-            f"{where}: format version {found_version}, this program reads {known}; bake the dataset again with this program"
+            f"{where}: format version {found_version}, this program reads version {known}; bake the dataset again with this program"
         )
     if header_bytes > MAX_HEADER_BYTES or raw_bytes > MAX_RAW_BYTES or len(data) != PREFIX_BYTES + header_bytes + payload_bytes:
         raise CorruptFileError(

@@ -106,7 +106,7 @@ def encode(texels: DistantTexels, bake_id: str) -> bytes:
 
 def decode(data: bytes, where: str) -> tuple[DistantTexels, str]:
     """Texels of a distant file, and their bake's id. Raises CorruptFileError or FormatVersionError."""
-    found = container.decode(data, KIND, VERSION, where, SKY_VERSION)
+    found = container.decode(data, KIND, (SKY_VERSION, VERSION), where)
     has_transfer, meta, arrays = found.version > SKY_VERSION, {"origin", "bake_id"}, {"sky", "valid"}
     if has_transfer:
         meta, arrays = meta | {"schedules"}, arrays | {"sky_transfer", "sun_transfer", "glow"}

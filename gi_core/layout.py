@@ -11,7 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from gi_core.basis import SH_NORM
 from gi_core.constants import SNOW_ALBEDO
+from gi_core.factor_weights import AMPLITUDES
 
 # The sun and the moon.
 MAX_DIRECTIONAL_LIGHTS = 2
@@ -43,6 +45,8 @@ SHADOW_TAPS = 4
 # Floats from one row of the map to the next: 64 bytes more than the 1024 texels, so that texels under one another do not all compete for
 # the same places of a cache.
 SHADOW_ROW_TEXELS = 1040
+# What makes weights of squares of harmonics' codes, beside a probe's scale (gi_core.factor_weights).
+HARMONIC_SQUARES = (AMPLITUDES / SH_NORM).tolist()
 
 _SCALARS = {"float": "f4", "uint": "u4", "int": "i4"}
 
@@ -191,6 +195,7 @@ CONSTANTS: dict[str, int | float] = {
     "SHADOW_BIAS_CELLS": SHADOW_BIAS_CELLS,
     "SHADOW_TAPS": SHADOW_TAPS,
     "SHADOW_ROW_TEXELS": SHADOW_ROW_TEXELS,
+    **{f"SQUARE_{b}": value for b, value in enumerate(HARMONIC_SQUARES)},
 }
 
 

@@ -24,6 +24,7 @@ from gi_core import factor_weights
 from gi_core.arrays import AnyArray, Float16, Float32, Int8, Int32, Int64, UInt8, UInt16, UInt32
 from gi_core.constants import ALBEDO_MAX, BASIS_SIZES, MAX_BRICK_LEVEL, MAX_PROBES_PER_SECTOR, MAX_SKY_PATCHES
 from gi_core.errors import CorruptFileError
+from gi_core.factor_weights import DIRECTION_STEPS, FACE_STEPS, HARMONIC_CODES, Codes
 from gi_core.grid import SectorIndex, voxel_columns
 
 PROBE_ON_GROUND, PROBE_ON_WALL, PROBE_IN_MARGIN = 1, 2, 4  # bits of probe_flags
@@ -38,8 +39,9 @@ class Sector:
     probe_room : (P,) uint16, 0 outdoors
     factor_starts : (P + 1,) uint32
     factor_source : (F,) uint32, < N a brick, otherwise sky patch source - N; a probe's bricks come first
-    factor_code : (F, B) uint8, of harmonics int8 (gi_core.factor_weights)
-    factor_scale : (P, 2, B) float16: of each probe's bricks, and of its sky
+    factor_code : (F, 6) uint8 of the cube, (F, 4) int8 of harmonics (gi_core.factor_weights)
+    factor_scale : (P, 2, 6) float16 of the cube, (P, 2, 1) of harmonics: of each probe's bricks, and of its sky
+    factor_trim : (P, 2, B - 1) int8, of harmonics; None of the cube
     brick_starts : (N + 1,) uint32; no brick is empty
     brick_level : (N,) uint8; a brick's cell is BRICK_CELL_M * 2 ** level wide, its surfels' cells SURFEL_CELL_M * 2 ** level
     brick_cell : (N, 3) int32, which cell of that size in sector-local space
@@ -68,6 +70,7 @@ class Sector:
     factor_source: UInt32
     factor_code: UInt8 | Int8
     factor_scale: Float16
+    factor_trim: Int8 | None
     brick_starts: UInt32
     brick_level: UInt8
     brick_cell: Int32
@@ -104,7 +107,7 @@ class Sector:
 
     @property
     def basis_size(self) -> int:
-        return int(self.factor_code.shape[1])
+        return BASIS_SIZES["cube"] if self.factor_trim is None else 1 + int(self.factor_trim.shape[2])
 
     @cached_property
     def sky_starts(self) -> UInt32:
@@ -114,7 +117,11 @@ class Sector:
     @cached_property
     def factor_weight(self) -> Float32:
         """(F, B) float32: what the codes stand for. Kernels read the codes; this is for the twin, and for looking."""
-        return factor_weights.decode(self.factor_code, self.factor_scale, self.factor_starts, self.sky_starts)
+        return factor_weights.decode(self.factor_codes, self.factor_starts, self.sky_starts)
+
+    @property
+    def factor_codes(self) -> Codes:
+        return Codes(self.factor_code, self.factor_scale, self.factor_trim)
 
     @property
     def nbytes(self) -> int:
@@ -149,8 +156,10 @@ def check_sector(sector: Sector, sky_patches: int) -> None:
 
     expect(s.probe_count <= MAX_PROBES_PER_SECTOR, f"at most {MAX_PROBES_PER_SECTOR} probes, got {s.probe_count}")
     expect(1 <= sky_patches <= MAX_SKY_PATCHES, f"1 to {MAX_SKY_PATCHES} sky patches, got {sky_patches}")
-    expect(s.factor_code.ndim == 2 and s.basis_size in BASIS_SIZES.values(), f"factor_code of a basis {BASIS_SIZES}")
-    expect(s.factor_code.dtype == (np.uint8 if s.basis_size == BASIS_SIZES["cube"] else np.int8), "codes with a sign, but for the cube's")
+    is_cube, trims = s.factor_trim is None, s.basis_size - 1
+    codes, scales = (trims + 1, trims + 1) if is_cube else (HARMONIC_CODES, 1)
+    expect(is_cube or s.basis_size in BASIS_SIZES.values(), f"factor_trim of a basis {BASIS_SIZES}")
+    expect(s.factor_code.dtype == (np.uint8 if is_cube else np.int8), "codes with a sign, but for the cube's")
     expect_starts(s.factor_starts, s.probe_count, s.factor_count, "factor_starts")
     expect_starts(s.brick_starts, s.brick_count, s.surfel_count, "brick_starts")
     expect((counts(s.brick_starts) > 0).all(), "no empty brick")
@@ -158,8 +167,9 @@ def check_sector(sector: Sector, sky_patches: int) -> None:
         (s.probe_count, "probe_position", (3,)),
         (s.probe_count, "probe_flags", ()),
         (s.probe_count, "probe_room", ()),
-        (s.factor_count, "factor_code", (s.basis_size,)),
-        (s.probe_count, "factor_scale", (2, s.basis_size)),
+        (s.factor_count, "factor_code", (codes,)),
+        (s.probe_count, "factor_scale", (2, scales)),
+        (s.probe_count, "factor_trim", (2, trims)),
         (s.brick_count, "brick_cell", (3,)),
         (s.brick_count, "brick_level", ()),
         (s.surfel_count, "surfel_normal", (3,)),
@@ -200,7 +210,11 @@ def check_sector(sector: Sector, sky_patches: int) -> None:
         is_sky, starts_sky = s.factor_source >= s.brick_count, np.zeros(s.factor_count + 1, bool)
         starts_sky[s.factor_starts] = True
         expect((is_sky[1:] | ~is_sky[:-1] | starts_sky[1:-1]).all(), "each probe's bricks before its sky patches")
-        totals = factor_weights.share_sums(s.factor_code, s.factor_scale, s.factor_starts, s.sky_starts)
+        totals = factor_weights.share_sums(s.factor_codes, s.factor_starts, s.sky_starts)
         # Rounded weights; 1 % leaves each bounce losing 4 % even where every albedo is at its bound.
         expect((totals <= 1.01).all(), f"a probe's factor weights to sum to at most 1 in each basis function, got {totals.max():.3f}")
+        if not is_cube:
+            expect((s.factor_code[:, 0] >= 0).all(), "no negative factor weights")
+            longest = factor_weights.longest_direction(s.factor_code)
+            expect(longest <= FACE_STEPS, f"directions of at most {FACE_STEPS} steps, {DIRECTION_STEPS} of them a unit, got {longest:.1f}")
     expect(s.surfel_emission is None or (s.surfel_emission >= 0).all(), "no negative surfel_emission")

@@ -1,26 +1,34 @@
 """Sector <-> bytes of a ``.gisec`` file. FORMAT.md describes each array; the two functions here mirror each other."""
 
+from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gi_core import container, quantise
-from gi_core.arrays import AnyArray
-from gi_core.constants import ALBEDO_MAX, BASIS_SIZES, BRICK_CELL_M, MAX_BRICK_LEVEL
+from gi_core import container, quantise, voxel_lists
+from gi_core.arrays import AnyArray, Float32, Float64
+from gi_core.constants import ALBEDO_MAX, BASIS_SIZES, BRICK_CELL_M, MAX_BRICK_LEVEL, MAX_SKY_PATCHES
 from gi_core.container import Container
-from gi_core.errors import CorruptFileError
+from gi_core.errors import CorruptFileError, FormatVersionError
+from gi_core.factor_directions import brick_centres, expected_directions
+from gi_core.factor_weights import Codes
 from gi_core.grid import SectorIndex
 from gi_core.sector import Sector, check_sector, counts, starts
 
 KIND = "SECT"
-VERSION = 1
+VERSION = 2
+VERSIONS = (1, 2)
 NO_PROBE = 0xFFFF
 # Kernels are built for the number of probes that a surfel or voxel blends: a file must not choose how long a compiler runs.
 MAX_BLENDED_PROBES = 32
 # A brick's cell is divided into 256 steps: 1.6 cm of 4 m.
 _CELL_STEPS = 256
+# Along a surfel's surface an eighth of them will do: 12 cm of a cell of 1 m. Across it, shadows would begin below the surface.
+_STEPS_ALONG = 8
+# Lists are stored once, and a voxel's list may be any: this bounds what readers make of it.
+MAX_VOXEL_PROBES = 1 << 26
 _META = frozenset({"sector", "sky_patches", "voxel_first", "bake"})
 # Fields that are stored under another name: starts as counts, positions within their brick's cell.
 _RENAMED = {
@@ -29,38 +37,51 @@ _RENAMED = {
     "brick_starts": "brick_count",
     "surfel_position": "surfel_in_cell",
 }
-_ARRAYS = frozenset(_RENAMED.get(f.name, f.name) for f in fields(Sector)) - {"index", "voxel_first"}
+_ARRAYS = frozenset(_RENAMED.get(f.name, f.name) for f in fields(Sector)) - {"index", "voxel_first"} | {"factor_direction", "voxel_list"}
+_IN_HARMONICS = frozenset({"factor_direction", "factor_trim"})
+_SINCE_2 = frozenset({"voxel_list"})
 
 
 def encode(sector: Sector, meta: dict[str, Any], sky_patches: int) -> bytes:
     """Bytes of a sector file. ``meta`` is any JSON object: the baker's fingerprint, counts and report."""
     s = sector
     cell, size = _surfel_cells(s.brick_cell, s.brick_level, s.brick_starts)
-    in_cell = np.floor((s.surfel_position / size - cell) * _CELL_STEPS)
+    in_cell = np.clip(np.floor((s.surfel_position / size - cell) * _CELL_STEPS), 0, _CELL_STEPS - 1).astype(np.uint8).T
+    across = np.repeat(s.brick_direction // 2, counts(s.brick_starts)) == np.arange(3)[:, None]
+    in_cell = np.where(across, in_cell, in_cell // _STEPS_ALONG * _STEPS_ALONG + _STEPS_ALONG // 2).astype(np.uint8)
+    voxel_list, voxel_probe, voxel_weight = voxel_lists.pack(s.voxel_probe, s.voxel_weight)
+    probe_position = quantise.encode_length(s.probe_position).T
+    weight, direction = np.split(s.factor_code, [s.factor_scale.shape[2]], axis=1)
     feedback = np.where(s.feedback_weight > 0, s.feedback_probe, NO_PROBE).astype(np.uint16)
     arrays: dict[str, AnyArray] = {
-        "probe_position": quantise.encode_length(s.probe_position).T,
+        "probe_position": probe_position,
         "probe_flags": s.probe_flags,
         "probe_room": quantise.smallest_unsigned(s.probe_room),
         "factor_count": counts(s.factor_starts).astype(np.uint16),
-        "factor_source": s.factor_source.astype(np.uint32),
-        "factor_weight": s.factor_code.T,
+        "factor_source": quantise.smallest_unsigned(s.factor_source),
+        "factor_weight": weight.T,
         "factor_scale": np.moveaxis(s.factor_scale, 0, 2),
         "brick_count": counts(s.brick_starts).astype(np.uint16),
         "brick_level": s.brick_level,
         "brick_cell": s.brick_cell.T.astype(np.int32),
         "brick_direction": s.brick_direction,
-        "surfel_in_cell": np.clip(in_cell, 0, _CELL_STEPS - 1).astype(np.uint8).T,
+        "surfel_in_cell": in_cell,
         "surfel_normal": quantise.encode_unit(s.surfel_normal),
-        "surfel_albedo": quantise.encode_root(s.surfel_albedo).T,
+        "surfel_albedo": quantise.encode_root(s.surfel_albedo),
         "surfel_snow": quantise.encode_fraction(s.surfel_snow),
         "feedback_probe": feedback.T,
-        "sun_visibility": s.sun_visibility,
+        "sun_visibility": np.ascontiguousarray(s.sun_visibility, "<u4").view(np.uint8),
         "voxel_class": s.voxel_class,
         "voxel_room": quantise.smallest_unsigned(s.voxel_room),
-        "voxel_probe": np.moveaxis(s.voxel_probe, 3, 0),
-        "voxel_weight": np.moveaxis(quantise.encode_fraction(s.voxel_weight), 3, 0),
+        "voxel_list": quantise.smallest_unsigned(voxel_list),
+        "voxel_probe": voxel_probe,
+        "voxel_weight": voxel_weight,
     }
+    if s.factor_trim is not None:
+        centres = brick_centres(s.brick_cell, s.brick_level, s.brick_starts, in_cell)
+        expected = expected_directions(probe_position, centres, s.factor_starts, s.factor_source, sky_patches)
+        arrays["factor_direction"] = direction - expected.T  # wraps
+        arrays["factor_trim"] = np.moveaxis(s.factor_trim, 0, 2)
     if s.feedback_probe.shape[1] > 1:
         # Shares only count beside each other: the largest of a surfel has all of a byte.
         arrays["feedback_weight"] = quantise.encode_fraction(
@@ -80,7 +101,12 @@ def encode(sector: Sector, meta: dict[str, Any], sky_patches: int) -> bytes:
 
 def decode(data: bytes, where: str) -> tuple[Sector, dict[str, Any]]:
     """A sector and its baker's meta, every count, range and index checked. Raises CorruptFileError or FormatVersionError."""
-    found = container.decode(data, KIND, VERSION, where)
+    found = container.decode(data, KIND, VERSIONS, where)
+    weights = found.arrays.get("factor_weight")
+    if found.version == 1 and weights is not None and weights.shape[:1] != (BASIS_SIZES["cube"],):
+        raise FormatVersionError(
+            f"{where}: format version 1 in harmonics, this program reads version {VERSION}; bake the dataset again with this program"
+        )
     try:
         sector = _sector(found)
         check_sector(sector, int(found.meta["sky_patches"]))
@@ -109,22 +135,29 @@ def _surfel_cells(brick_cell: AnyArray, brick_level: AnyArray, brick_starts: Any
 
 def _sector(found: Container) -> Sector:
     take = found.take
-    found.refuse_unknown(_META, _ARRAYS)
+    absent = _IN_HARMONICS if "factor_trim" not in found.arrays or found.version == 1 else frozenset()
+    found.refuse_unknown(_META, _ARRAYS - absent - (_SINCE_2 if found.version == 1 else frozenset()))
     factor_starts, brick_starts = starts(take("factor_count", "u2", 1)), starts(take("brick_count", "u2", 1))
     brick_cell = np.ascontiguousarray(take("brick_cell", "i4", 2).T)
     brick_level = take("brick_level", "u1", 1)
-    source = take("factor_source", "u4", 1)
-    in_cell = take("surfel_in_cell", "u1", 2).T
+    source = _unsigned(found, "factor_source", 1, 1 << 32).astype(np.uint32)
+    in_cell = take("surfel_in_cell", "u1", 2)
     # A wrong count would otherwise size the arrays that np.repeat makes.
-    if int(factor_starts[-1]) != len(source) or int(brick_starts[-1]) != len(in_cell) or len(brick_cell) != len(brick_starts) - 1:
+    if int(factor_starts[-1]) != len(source) or in_cell.shape != (3, int(brick_starts[-1])) or len(brick_cell) != len(brick_starts) - 1:
         raise CorruptFileError("counts per probe or brick do not add up")
     if brick_level.max(initial=0) > MAX_BRICK_LEVEL:
         raise CorruptFileError(f"expected brick levels up to {MAX_BRICK_LEVEL}, got {brick_level.max()}")
+    if (counts(brick_starts) <= 0).any() or brick_cell.shape[1:] != (3,):
+        raise CorruptFileError("expected no empty brick, and three coordinates of each")
+    probe_position = take("probe_position", "i4", 2)
+    codes = _codes(found, probe_position, lambda: brick_centres(brick_cell, brick_level, brick_starts, in_cell), factor_starts, source)
     cell, size = _surfel_cells(brick_cell, brick_level, brick_starts)
-    position = (cell + (in_cell.astype(np.float64) + 0.5) / _CELL_STEPS) * size
+    albedo = take("surfel_albedo", "u1", 2)
+    position = (cell + (in_cell.T.astype(np.float64) + 0.5) / _CELL_STEPS) * size
     feedback = take("feedback_probe", "u2", 2).T
-    voxel_share = np.moveaxis(take("voxel_weight", "u1", 4), 0, 3)
-    if not 1 <= feedback.shape[1] <= MAX_BLENDED_PROBES or not 1 <= voxel_share.shape[3] <= MAX_BLENDED_PROBES:
+    voxel_class = take("voxel_class", "u1", 3)
+    voxel_probe, voxel_weight = _voxels(found, voxel_class)
+    if not 1 <= feedback.shape[1] <= MAX_BLENDED_PROBES or not 1 <= voxel_weight.shape[3] <= MAX_BLENDED_PROBES:
         raise CorruptFileError(f"expected 1 to {MAX_BLENDED_PROBES} probes for each surfel and voxel")
     lit = feedback != NO_PROBE
     if feedback.shape[1] > 1:
@@ -132,19 +165,16 @@ def _sector(found: Container) -> Sector:
         feedback_weight = share / np.maximum(share.sum(axis=1, keepdims=True), 1)
     else:
         feedback_weight = lit
-    voxel_share = voxel_share.astype(np.float32)
-    voxel_weight = voxel_share / np.maximum(voxel_share.sum(axis=3, keepdims=True), 1)
     emission = take("surfel_emission", "f4", 2).T if "surfel_emission" in found.arrays else None
     index = found.meta["sector"]
     return Sector(
         index=SectorIndex(int(index[0]), int(index[1])),
-        probe_position=np.ascontiguousarray(quantise.decode_length(take("probe_position", "i4", 2).T), np.float32),
+        probe_position=np.ascontiguousarray(quantise.decode_length(probe_position.T), np.float32),
         probe_flags=take("probe_flags", "u1", 1),
-        probe_room=_unsigned(found, "probe_room").astype(np.uint16),
+        probe_room=_unsigned(found, "probe_room", 1).astype(np.uint16),
         factor_starts=factor_starts,
         factor_source=source,
-        factor_code=container.interleaved(_weight_codes(found)),
-        factor_scale=np.ascontiguousarray(np.moveaxis(take("factor_scale", "f2", 3), 2, 0)),
+        **codes._asdict(),
         brick_starts=brick_starts,
         brick_level=brick_level,
         brick_cell=brick_cell,
@@ -152,28 +182,64 @@ def _sector(found: Container) -> Sector:
         surfel_position=np.ascontiguousarray(position, np.float32),
         surfel_normal=quantise.decode_unit(take("surfel_normal", "u1", 2)),
         # The code next to 0.95 stands for 0.9535, and the bounces' convergence rests on the bound.
-        surfel_albedo=np.minimum(quantise.decode_root(take("surfel_albedo", "u1", 2)).T, np.float32(ALBEDO_MAX)),
+        surfel_albedo=np.minimum(quantise.decode_root(albedo.T if found.version == 1 else albedo), np.float32(ALBEDO_MAX)),
         surfel_snow=take("surfel_snow", "u1", 1).astype(np.float32) / np.float32(255),
         surfel_emission=None if emission is None else np.ascontiguousarray(emission),
         feedback_probe=np.ascontiguousarray(np.where(lit, feedback, 0), np.uint16),
         feedback_weight=np.ascontiguousarray(feedback_weight, np.float32),
-        sun_visibility=take("sun_visibility", "u4", 2),
+        sun_visibility=take("sun_visibility", "u4", 2) if found.version == 1 else _words(take("sun_visibility", "u1", 2)),
         voxel_first=np.array([int(v) for v in found.meta["voxel_first"]], np.int32),
-        voxel_class=take("voxel_class", "u1", 3),
-        voxel_room=_unsigned(found, "voxel_room").astype(np.uint16),
-        voxel_probe=np.ascontiguousarray(np.moveaxis(take("voxel_probe", "u2", 4), 0, 3)),
-        voxel_weight=np.ascontiguousarray(voxel_weight, np.float32),
+        voxel_class=voxel_class,
+        voxel_room=_unsigned(found, "voxel_room", 3).astype(np.uint16),
+        voxel_probe=voxel_probe,
+        voxel_weight=voxel_weight,
     )
 
 
-def _weight_codes(found: Container) -> AnyArray:
-    """factor_weight: (6, F) unsigned for the cube, (4, F) or (9, F) signed for spherical harmonics."""
-    values = found.arrays.get("factor_weight")
-    return found.take("factor_weight", "u1" if values is None or len(values) == BASIS_SIZES["cube"] else "i1", 2)
+def _codes(found: Container, probe_position: AnyArray, centres: Callable[[], Float64], factor_starts: AnyArray, source: AnyArray) -> Codes:
+    """The cube's are all stored; harmonics' directions beside what their bricks' ``centres`` let expect."""
+    scale = np.ascontiguousarray(np.moveaxis(found.take("factor_scale", "f2", 3), 2, 0))
+    if "factor_trim" not in found.arrays:
+        return Codes(container.interleaved(found.take("factor_weight", "u1", 2)), scale, None)
+    weight, difference = found.take("factor_weight", "i1", 2), found.take("factor_direction", "i1", 2)
+    patches = int(found.meta["sky_patches"])
+    if weight.shape != (1, len(source)) or difference.shape != (len(source), 3) or probe_position.shape != (3, len(factor_starts) - 1):
+        raise CorruptFileError(f"expected a weight and a direction of {len(source)} factors, and three coordinates a probe")
+    if not 1 <= patches <= MAX_SKY_PATCHES:
+        raise CorruptFileError(f"expected 1 to {MAX_SKY_PATCHES} sky patches, got {patches}")
+    expected = expected_directions(probe_position, centres(), factor_starts, source, patches)
+    for row, column in zip(expected, difference.T, strict=True):
+        row += column  # wraps
+    trim = np.ascontiguousarray(np.moveaxis(found.take("factor_trim", "i1", 3), 2, 0))
+    return Codes(container.interleaved(np.concatenate([weight, expected])), scale, trim)
 
 
-def _unsigned(found: Container, name: str) -> AnyArray:
+def _words(octets: AnyArray) -> AnyArray:
+    """Bytes (D, 4 n) -> uint32 (D, n). Raises CorruptFileError where no words come of them."""
+    if octets.shape[1] % 4:
+        raise CorruptFileError(f"expected whole words of sun visibility, got {octets.shape[1]} bytes")
+    return octets.view("<u4").astype(np.uint32, copy=False)
+
+
+def _voxels(found: Container, voxel_class: AnyArray) -> tuple[AnyArray, Float32]:
+    """Probes (ny, nz, nx, K) uint16 and weights float32 of each voxel."""
+    rank = 4 if found.version == 1 else 2
+    probe, code = (np.moveaxis(found.take(name, dtype, rank), 0, -1) for name, dtype in (("voxel_probe", "u2"), ("voxel_weight", "u1")))
+    if probe.shape != code.shape or code.shape[-1] * voxel_class.size > MAX_VOXEL_PROBES:
+        raise CorruptFileError(f"expected as many weights as probes, and at most {MAX_VOXEL_PROBES} of all voxels")
+    share = code.astype(np.float32)
+    weight = share / np.maximum(share.sum(axis=-1, keepdims=True), 1)
+    if found.version > 1:
+        codes = _unsigned(found, "voxel_list", 3)
+        if codes.shape != voxel_class.shape:
+            raise CorruptFileError(f"expected a list of probes for each of {voxel_class.shape} voxels, got {codes.shape}")
+        number = voxel_lists.numbers(codes, len(probe))
+        probe, weight = probe[number], weight[number]
+    return np.ascontiguousarray(probe), np.ascontiguousarray(weight, np.float32)
+
+
+def _unsigned(found: Container, name: str, ndim: int, below: int = 1 << 16) -> AnyArray:
     values = found.arrays.get(name)
-    if values is None or values.dtype.kind != "u" or values.max(initial=0) > 0xFFFF:
-        raise CorruptFileError(f"array {name!r} of unsigned integers below 65536 is missing")
+    if values is None or values.dtype.kind != "u" or values.ndim != ndim or values.max(initial=0) >= below:
+        raise CorruptFileError(f"array {name!r} of unsigned integers below {below} is missing")
     return values

@@ -66,6 +66,22 @@ def patch_of(directions: AnyArray, patches: int) -> Int64:
     return np.asarray(first[row] + np.minimum((turn * count[row]).astype(np.int64), count[row] - 1))
 
 
+@cache
+def patch_centres(patches: int) -> Float64:
+    """(patches, 3), unit: the middle of each patch in height and azimuth; of the cap, and of fewer patches than make a dome, the zenith."""
+    middles = np.zeros((patches, 3))
+    middles[:, 1] = 1
+    if patches < MIN_PATCHES:
+        return middles
+    first, edges = 1, _edges(patches)
+    for row, count in enumerate(patches_in_rows(patches)[1:], start=1):
+        turn, height = 2 * np.pi * (np.arange(count) + 0.5) / count, (edges[row] + edges[row + 1]) / 2
+        radius = np.sqrt(1 - height * height)
+        middles[first : first + count] = np.stack([radius * np.cos(turn), np.full(count, height), radius * np.sin(turn)], axis=1)
+        first += count
+    return middles
+
+
 def patch_radiance(sky_radiance: Float32, patches: int) -> Float64:
     """(patches, 3) [cd m^-2]: the mean radiance of each, by exact solid angle. ``sky_radiance`` is a map as in ``Lighting``."""
     texel_edges = np.cos(np.pi * np.arange(_ROWS + 1) / SKY_SHAPE[0])

@@ -17,6 +17,12 @@
 #ifndef BASIS_SIZE
 #error "BASIS_SIZE is not defined"
 #endif
+#include "layout.h"
+#if BASIS_SIZE == 4
+#define PER_SQUARE (float4)(SQUARE_0, SQUARE_1, SQUARE_2, SQUARE_3)
+#elif BASIS_SIZE == 9
+#define PER_SQUARE (float8)(SQUARE_0, SQUARE_1, SQUARE_2, SQUARE_3, SQUARE_4, SQUARE_5, SQUARE_6, SQUARE_7)
+#endif
 
 #if BASIS_SIZE == 4
 typedef float4 weights_t;
@@ -89,12 +95,23 @@ inline void gather_probe(
             ++f;
         }
         __global const float *scales = factor_scale + (2 * probe + kind) * BASIS_SIZE;
-        const weights_t scale = *(__global const loose_weights_t *)scales;
-        all_red += scale * (red + odd_red);
-        all_green += scale * (green + odd_green);
-        all_blue += scale * (blue + odd_blue);
+        weights_t scale = *(__global const loose_weights_t *)scales;
+        red += odd_red;
+        green += odd_green;
+        blue += odd_blue;
+#if BASIS_SIZE == 6
+        all_red += scale * red;
+        all_green += scale * green;
+        all_blue += scale * blue;
+#else
+        const weights_t per_square = scales[0] * PER_SQUARE;
+        scale.s0 = 0.0f; // the others are trims: so much more for each square of the first code
+        all_red += per_square * red + scale * red.s0;
+        all_green += per_square * green + scale * green.s0;
+        all_blue += per_square * blue + scale * blue.s0;
+#endif
 #if BASIS_SIZE == 9
-        all_last += scales[8] * (last + odd_last);
+        all_last += scales[0] * SQUARE_8 * (last + odd_last) + scales[8] * (float4)(red.s0, green.s0, blue.s0, 0.0f);
 #endif
     }
     // Private arrays of floats: the one way to index a vector by a variable.

@@ -21,6 +21,15 @@
 #define SHADOW_BIAS_CELLS 0.05f
 #define SHADOW_TAPS 4
 #define SHADOW_ROW_TEXELS 1040
+#define SQUARE_0 3.544907701811032f
+#define SQUARE_1 6.139960247678931f
+#define SQUARE_2 6.139960247678931f
+#define SQUARE_3 6.139960247678931f
+#define SQUARE_4 1.8305824657275378f
+#define SQUARE_5 1.8305824657275378f
+#define SQUARE_6 3.1706618380848086f
+#define SQUARE_7 1.8305824657275378f
+#define SQUARE_8 2.7458736985913066f
 
 // How much of one row of the probes' light a brick sends on, per channel. row : ROW_ONE + probe * coefficients, and of the cube + face.
 typedef struct {

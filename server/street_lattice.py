@@ -76,7 +76,7 @@ class _Columns:
 
 def _levels(dataset: Dataset, index: SectorIndex, shape: tuple[int, int]) -> list[int]:
     path = dataset.sector_path(index)
-    found = container.decode(container.read_bytes(path), sector_file.KIND, sector_file.VERSION, str(path))
+    found = container.decode(container.read_bytes(path), sector_file.KIND, sector_file.VERSIONS, str(path))
     kind = found.take("voxel_class", "u1", 3)
     first = found.meta.get("voxel_first")
     if not isinstance(first, list) or len(first) != 3 or not all(isinstance(n, int) and abs(n) < -_NO_STREET // 2 for n in first):

@@ -13,7 +13,7 @@ from bake_jobs.scene import Scene
 from bake_jobs.sector_job import SectorBaker
 from bake_jobs.solids import boxes, prism
 from gi_core import factor_weights
-from gi_core.basis import basis_of_size, factor_shares
+from gi_core.basis import basis_of_size, projection_weights
 from gi_core.grid import SectorIndex
 from gi_core.sector import Sector, starts
 
@@ -62,9 +62,10 @@ def random_sector(
         total = np.bincount(probe_of_factor, weight[:, face], probes)
         weight[:, face] /= np.maximum(total, 1)[probe_of_factor]
     if basis != 6:
-        weight *= rng.choice([-1, 1], weight.shape)
-        weight /= factor_shares(basis_of_size(basis))
-    factor_code, factor_scale = factor_weights.encode(weight, starts(per_probe), source >= len(bricks))
+        towards = rng.normal(size=(factors, 3))
+        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+        weight = 4 * weight[:, :1] * projection_weights(basis_of_size(basis), towards)  # a quarter is the first one's share
+    codes = factor_weights.encode(weight, starts(per_probe), source >= len(bricks))
     shape = (4, 20, 20)
     voxel_weight = rng.uniform(0, 1, (*shape, voxel_probes))
     feedback_weight = rng.uniform(0.1, 1, (surfels, feedback))
@@ -75,8 +76,7 @@ def random_sector(
         probe_room=rng.integers(0, 3, probes).astype(np.uint16),
         factor_starts=starts(per_probe),
         factor_source=source,
-        factor_code=factor_code,
-        factor_scale=factor_scale,
+        **codes._asdict(),
         brick_starts=starts(np.array(bricks, np.int64)),
         brick_level=brick_level,
         brick_cell=brick_cell,

@@ -110,9 +110,7 @@ def test_a_file_of_another_version_is_named(root, read):
         data = bytearray(path.read_bytes())
         data[12] = 9
         path.write_bytes(data)
-    with pytest.raises(
-        FormatVersionError, match=r"(0_0|distant)\..*: format version 9, .* (version 1|versions 1 to 2); bake the dataset again"
-    ):
+    with pytest.raises(FormatVersionError, match=r"(0_0|distant)\..*: format version 9, .* version 1( or 2)?; bake the dataset again"):
         read(Dataset.open(root), HERE)
 
 
@@ -254,7 +252,10 @@ def test_sectors_of_any_index_keep_their_voxels(make_sector, index):
     found = sector_file.quantised(moved, 6)
     assert found.index == index
     np.testing.assert_array_equal(found.voxel_first, moved.voxel_first)
-    np.testing.assert_array_equal(found.voxel_probe, moved.voxel_probe)
+    # In whatever order a voxel lists its probes: its weights are whole thirty-firsts of the largest.
+    light = np.linspace(0, 1, sector.probe_count)
+    blended = [(s.voxel_weight * light[s.voxel_probe]).sum(axis=3) / s.voxel_weight.sum(axis=3) for s in (found, moved)]
+    np.testing.assert_allclose(*blended, atol=2 / 31)
 
 
 def test_what_a_resumed_bake_must_not_keep_is_noticed(root):

@@ -15,12 +15,14 @@ from gi_core import container, distant_file, geometry_file, sector_file
 from gi_core.errors import FormatError
 from gi_core.sector import check_sector
 
-GOLDEN = Path(__file__).parents[1] / "golden" / "v1"
+GOLDEN = Path(__file__).parents[1] / "golden"
 FILES = {
-    "SECT": (GOLDEN / "sectors" / "0_0.gisec", sector_file.decode),
-    "GEOM": (GOLDEN / "geometry" / "0_0.gigeo", geometry_file.decode),
-    "DIST": (GOLDEN / "distant.gidist", distant_file.decode),
-    "DIST 2": (GOLDEN.parent / "distant_v2" / "distant.gidist", distant_file.decode),
+    "SECT": (GOLDEN / "v1" / "sectors" / "0_0.gisec", sector_file.decode),
+    "SECT 2": (GOLDEN / "v4_sector2" / "sectors" / "0_0.gisec", sector_file.decode),
+    "SECT 2 in harmonics": (GOLDEN / "v2_sector2" / "sectors" / "0_0.gisec", sector_file.decode),
+    "GEOM": (GOLDEN / "v1" / "geometry" / "0_0.gigeo", geometry_file.decode),
+    "DIST": (GOLDEN / "v1" / "distant.gidist", distant_file.decode),
+    "DIST 2": (GOLDEN / "distant_v2" / "distant.gidist", distant_file.decode),
 }
 
 
@@ -37,7 +39,9 @@ PARTS = {kind: parts(kind) for kind in FILES}
 def assemble(kind: str, header: Any, raw: bytes) -> bytes:
     text = json.dumps(header).encode()
     payload = zstandard.ZstdCompressor(level=1).compress(raw)
-    prefix = container._PREFIX.pack(container.MAGIC, kind[:4].encode(), int(kind[4:] or 1), len(text), 0, len(payload), len(raw), bytes(16))
+    prefix = container._PREFIX.pack(
+        container.MAGIC, kind[:4].encode(), FILES[kind][0].read_bytes()[12], len(text), 0, len(payload), len(raw), bytes(16)
+    )
     return prefix[:40] + container._digest(prefix, text, payload) + prefix[56:] + text + payload
 
 
@@ -52,8 +56,8 @@ def read(kind: str, data: bytes) -> bool:
         assert refusal.startswith("bad.file: ")
         assert "\n" not in refusal
         return False
-    if kind == "SECT":
-        check_sector(found[0], 6)
+    if kind.startswith("SECT"):
+        check_sector(found[0], 1024)
         assert (found[0].voxel_weight.sum(axis=3) < 1.001).all()  # float32 shares of at most 32
     elif kind == "GEOM":
         assert np.isfinite(found[0].vertices[found[0].triangles]).all()

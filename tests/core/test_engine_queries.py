@@ -217,6 +217,7 @@ def test_a_sector_without_probes_takes_its_neighbours_light(city):
         factor_source=whole.factor_source[:0],
         factor_code=whole.factor_code[:0],
         factor_scale=whole.factor_scale[:0],
+        factor_trim=None if whole.factor_trim is None else whole.factor_trim[:0],
         feedback_weight=0 * whole.feedback_weight,
         voxel_probe=0 * whole.voxel_probe,
         voxel_weight=0 * whole.voxel_weight,

@@ -39,7 +39,7 @@ from gi_core.stream_plan import StreamOptions
 from gi_core.world import Lamp
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "v1"
-HARMONICS = GOLDEN.parent / "v2"
+HARMONICS = GOLDEN.parent / "v2_sector2"
 STREET = np.array([5.0, 2.0, 30.0])  # its volume reads both sectors
 EAST = np.array([1.0, 0.0, 0.0])
 LATE_S = 30.0

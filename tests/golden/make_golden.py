@@ -1,4 +1,6 @@
-"""Writes tests/golden/v<version>: a dataset of two sectors, small enough to keep, that has every array of the format.
+"""Writes tests/golden/v<version>_sector<version>: datasets of two sectors, small enough to keep, that have every array of the format.
+
+The versions are those of world.json and of sector files; folders without the latter have sector files of version 1.
 
     python tests/golden/make_golden.py
 
@@ -144,6 +146,12 @@ def write_distant(target: Path) -> None:
     write_atomic(target, distant_file.encode(texels, BAKE_ID))
 
 
+# Of the cube and of harmonics, whose sector files have other arrays.
+WRITTEN = {
+    f"v{VERSION}_sector{sector_file.VERSION}": (SETTINGS, scene_v5()),
+    f"v2_sector{sector_file.VERSION}": (SETTINGS_V2, tiny_scene()),
+}
+
 if __name__ == "__main__":
-    target = Path(__file__).parent / f"v{VERSION}"
-    print(target, write_golden(target, SETTINGS, scene_v5()).counts)
+    for name, (settings, scene) in WRITTEN.items():
+        print(name, write_golden(Path(__file__).parent / name, settings, scene).counts)

@@ -80,18 +80,91 @@ def shares(codes: np.ndarray) -> np.ndarray:
     return np.where(total > 0, codes / np.maximum(total, 1), 0.0)
 
 
-def read_sector(data: bytes) -> tuple[dict[str, Any], Arrays]:
-    """meta, and the arrays under the names and shapes of gi_core.sector.Sector (section 3)."""
-    meta, a = read_container(data, "SECT")
+def directions(meta: dict[str, Any], a: Arrays) -> np.ndarray:
+    """(F, 3) y, z, x of each factor, in steps: what is expected, and the difference that is stored (section 3)."""
     factor_starts, brick_starts = starts(a["factor_count"]), starts(a["brick_count"])
-    bricks = len(a["brick_count"])
-    coefficients = len(a["factor_weight"])
-    weight = np.zeros((len(a["factor_source"]), coefficients))
-    decode, norms = (root, np.ones(6)) if coefficients == 6 else (signed_root, harmonic_norms()[:coefficients])
+    bricks, single = len(a["brick_count"]), np.float32
+    places = np.zeros((bricks + meta["sky_patches"], 3), single)
+    for brick in range(bricks):
+        step = 4 * 2 ** int(a["brick_level"][brick])
+        codes = a["surfel_in_cell"][:, brick_starts[brick] : brick_starts[brick + 1]].astype(np.int64)
+        mean = (2 * codes + 1).sum(axis=1) * np.float64(step) / codes.shape[1]
+        places[brick] = a["brick_cell"][:, brick] * 512.0 * step + mean
+    first = 0
+    for count in patches_in_rows(meta["sky_patches"]):
+        y = ((1 - first / meta["sky_patches"]) + (1 - (first + count) / meta["sky_patches"])) / 2
+        for k in range(count):
+            turn, level = 2 * math.pi * (k + 0.5) / count, math.sqrt(1 - y * y)
+            place = (0, 1, 0) if first == 0 else (level * math.cos(turn), y, level * math.sin(turn))
+            places[bricks + first + k] = np.array(place) * 2.0**40
+        first += count
+    found = np.zeros((len(a["factor_source"]), 3), np.int8)
+    for probe in range(len(a["factor_count"])):
+        at = a["probe_position"][:, probe].astype(single)
+        for f in range(factor_starts[probe], factor_starts[probe + 1]):
+            x, y, z = places[a["factor_source"][f]] - at
+            scale = single(16) / np.sqrt(max(x * x + y * y + z * z, single(1)))
+            found[f] = np.rint(np.array([y * scale, z * scale, x * scale])).astype(np.int8) + a["factor_direction"][f]
+    return found
+
+
+def harmonic_weights(meta: dict[str, Any], a: Arrays) -> np.ndarray:
+    """(F, B) of a file in harmonics (section 3)."""
+    bricks, basis = len(a["brick_count"]), 1 + a["factor_trim"].shape[1]
+    weight = np.zeros((len(a["factor_source"]), basis))
+    factor_starts, steps = starts(a["factor_count"]), directions(meta, a)
     for probe in range(len(a["factor_count"])):
         for f in range(factor_starts[probe], factor_starts[probe + 1]):
             kind = 0 if a["factor_source"][f] < bricks else 1
-            weight[f] = decode(a["factor_weight"][:, f]) * a["factor_scale"][kind, :, probe].astype(np.float64) / norms
+            y, z, x = (steps[f] / 16).tolist()
+            r = x * x + y * y + z * z
+            g = r if r <= 1.5625 else 32 / 45
+            second = [15 / 4 * x * y, 15 / 4 * y * z, 5 / 16 * (3 * z * z - r), 15 / 4 * x * z, 15 / 16 * (x * x - y * y)]
+            of_direction = np.array([2 * y, 2 * z, 2 * x, *(g * s for s in second)])[: basis - 1]
+            most = np.array([3, 3, 3, 2, 2, 1, 2, 1.5])[: basis - 1]
+            roots = np.sign(of_direction) * np.rint(127 * np.sqrt(np.minimum(np.abs(of_direction) / most, 1)))
+            first = int(a["factor_weight"][0, f])
+            codes = np.rint(first * roots / 127)
+            shares_of_first = [
+                signed_root(first),
+                *(most * signed_root(codes) + signed_root(first) * signed_root(a["factor_trim"][kind, :, probe])),
+            ]
+            weight[f] = np.array(shares_of_first) * np.float64(a["factor_scale"][kind, 0, probe]) / harmonic_norms()[:basis]
+    return weight
+
+
+def cube_weights(a: Arrays) -> np.ndarray:
+    """(F, 6) of a file in cubes (section 3)."""
+    weight = np.zeros((len(a["factor_source"]), 6))
+    factor_starts = starts(a["factor_count"])
+    for probe in range(len(a["factor_count"])):
+        for f in range(factor_starts[probe], factor_starts[probe + 1]):
+            kind = 0 if a["factor_source"][f] < len(a["brick_count"]) else 1
+            weight[f] = root(a["factor_weight"][:, f]) * a["factor_scale"][kind, :, probe].astype(np.float64)
+    return weight
+
+
+def voxel_blends(a: Arrays) -> tuple[np.ndarray, np.ndarray]:
+    """Probes and shares (ny, nz, nx, K), one voxel at a time (section 3)."""
+    weights, number, last = shares(a["voxel_weight"]), np.zeros(a["voxel_list"].size, int), -1
+    for v, code in enumerate(a["voxel_list"].reshape(-1).tolist()):
+        last += code == 0
+        number[v] = last if code == 0 else last + 1 - code
+    shape = (*a["voxel_list"].shape, len(weights))
+    return a["voxel_probe"].T[number].reshape(shape), weights.T[number].reshape(shape)
+
+
+def read_sector(data: bytes) -> tuple[dict[str, Any], Arrays]:
+    """meta, and the arrays under the names and shapes of gi_core.sector.Sector (section 3)."""
+    version = data[12]
+    meta, a = read_container(data, "SECT", version)
+    factor_starts, brick_starts = starts(a["factor_count"]), starts(a["brick_count"])
+    bricks = len(a["brick_count"])
+    weight = cube_weights(a) if "factor_trim" not in a else harmonic_weights(meta, a)
+    if version == 1:
+        voxel_probe, voxel_weight = (np.moveaxis(values, 0, 3) for values in (a["voxel_probe"], shares(a["voxel_weight"])))
+    else:
+        voxel_probe, voxel_weight = voxel_blends(a)
     position = np.zeros((brick_starts[-1], 3))
     for brick in range(bricks):
         for s in range(brick_starts[brick], brick_starts[brick + 1]):
@@ -112,16 +185,16 @@ def read_sector(data: bytes) -> tuple[dict[str, Any], Arrays]:
         "brick_direction": a["brick_direction"],
         "surfel_position": position,
         "surfel_normal": unit(a["surfel_normal"]),
-        "surfel_albedo": np.minimum(root(a["surfel_albedo"]), 0.95).T,
+        "surfel_albedo": np.minimum(root(a["surfel_albedo"].T if version == 1 else a["surfel_albedo"]), 0.95),
         "surfel_snow": a["surfel_snow"] / 255.0,
         "feedback_probe": np.where(lit, a["feedback_probe"], 0).T,
         "feedback_weight": shares(np.where(lit, feedback_codes, 0)).T,
-        "sun_visibility": a["sun_visibility"],
+        "sun_visibility": a["sun_visibility"] if version == 1 else np.ascontiguousarray(a["sun_visibility"]).view("<u4"),
         "voxel_first": np.array(meta["voxel_first"]),
         "voxel_class": a["voxel_class"],
         "voxel_room": a["voxel_room"],
-        "voxel_probe": np.moveaxis(a["voxel_probe"], 0, 3),
-        "voxel_weight": np.moveaxis(shares(a["voxel_weight"]), 0, 3),
+        "voxel_probe": voxel_probe,
+        "voxel_weight": voxel_weight,
     }
     if "surfel_emission" in a:
         decoded["surfel_emission"] = a["surfel_emission"].T

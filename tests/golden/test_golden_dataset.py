@@ -18,24 +18,31 @@ import pytest
 from gi_core import dataset, distant_file, fine_file, geometry_file, sector_file, sky_patches
 from gi_core.dataset import Dataset
 from gi_core.engine import Engine
+from gi_core.errors import FormatVersionError
 from gi_core.sector import Sector
 
 HERE = Path(__file__).parent
-# Of world.json's version: what the dataset of each holds, decoded.
+# Of world.json's version, and of sector files' where that is not 1: what the dataset of each holds, decoded.
 DIGESTS = {
-    1: "f6b367f763c6b74747559c79e7d8c404",
-    2: "b62685d963b990a7db7f1427109a44dd",
-    3: "2283c2edeaed38157e15ce4f9a3bd682",
-    4: "58c4bbdb83e26e00b45ed30d40b407d8",
-    5: "aeed474a1d5bba6557b6bc01afbbefc6",
+    "v1": "f6b367f763c6b74747559c79e7d8c404",
+    "v3": "2283c2edeaed38157e15ce4f9a3bd682",
+    "v4": "58c4bbdb83e26e00b45ed30d40b407d8",
+    "v5": "aeed474a1d5bba6557b6bc01afbbefc6",
+    "v2_sector2": "d4e9deba8154c6fa0b66c46e0e8ecf95",
+    "v4_sector2": "286608a0e21588e0ffdf44fac39a4619",
+    "v5_sector2": "7d257cd69f93d960f01310a3f20049ae",
 }
-GOLDEN = HERE / "v1"
-SECTORS = sorted(path for version in DIGESTS for path in (HERE / f"v{version}" / "sectors").iterdir())
-GEOMETRIES = sorted(path for version in DIGESTS for path in (HERE / f"v{version}" / "geometry").iterdir())
+# Sector files of version 1 in harmonics.
+REFUSED = "v2"
+FOLDERS = sorted([*DIGESTS, REFUSED])
+GOLDEN = HERE / "v4_sector2"
+SECTORS = sorted(path for name in DIGESTS for path in (HERE / name / "sectors").iterdir())
+GEOMETRIES = sorted(path for name in FOLDERS for path in (HERE / name / "geometry").iterdir())
 DISTANT_V2 = HERE / "distant_v2" / "distant.gidist"
 DISTANT_V2_DIGEST = "8ff8db0362f7c783bcf00d4cdb5c4d1f"
 FINE = sorted((HERE / "v3" / "fine").iterdir())
-each_version = pytest.mark.parametrize("golden", [HERE / f"v{version}" for version in DIGESTS], ids=lambda path: path.name)
+each_folder = pytest.mark.parametrize("golden", [HERE / name for name in FOLDERS], ids=lambda path: path.name)
+each_read = pytest.mark.parametrize("golden", [HERE / name for name in DIGESTS], ids=lambda path: path.name)
 
 
 def name_of(path: Path) -> str:
@@ -63,7 +70,7 @@ def stored_arrays(path: Path) -> set[tuple[str, str, bool, int]]:
     return {(a["name"], a["dtype"], a["delta"], len(a["shape"])) for a in header["arrays"]}
 
 
-@each_version
+@each_folder
 def test_the_golden_dataset_is_small_and_whole(golden):
     assert sum(path.stat().st_size for path in golden.rglob("*") if path.is_file()) < 75_000
     folders = ("sectors", "geometry", "fine") if golden.name == "v3" else ("sectors", "geometry")
@@ -74,18 +81,24 @@ def test_the_golden_dataset_is_small_and_whole(golden):
 
 def decoded_names() -> list[str]:
     """A sector's arrays, codes of weights as what they stand for."""
-    names = [field.name for field in fields(Sector) if field.name not in ("index", "factor_scale")]
+    names = [field.name for field in fields(Sector) if field.name not in ("index", "factor_scale", "factor_trim")]
     return ["factor_weight" if name == "factor_code" else name for name in names]
 
 
 def test_every_golden_version_is_read_or_refused_by_name():
-    versions = sorted(int(path.name[1:]) for path in HERE.glob("v*") if path.is_dir())
-    assert versions == list(DIGESTS)
-    assert versions[-1] == dataset.VERSION, "a new format version needs its golden dataset: run make_golden.py"
-    assert {sector_file.VERSION, geometry_file.VERSION, fine_file.VERSION} == {1}, "give tests of their v2 what these have"
+    assert sorted(path.name for path in HERE.glob("v*") if path.is_dir()) == FOLDERS
+    assert set(neighbour("make_golden").WRITTEN) <= set(FOLDERS), "a new format version needs its golden dataset: run make_golden.py"
+    assert {geometry_file.VERSION, fine_file.VERSION} == {1}, "give tests of their v2 what these have"
     assert distant_file.VERSION == 2, "a new version needs its golden file, as distant_v2 is"
-    for version in versions:
-        assert json.loads((HERE / f"v{version}" / "world.json").read_bytes())["version"] == version
+    for name in FOLDERS:
+        assert json.loads((HERE / name / "world.json").read_bytes())["version"] == int(name[1])
+        assert all(path.read_bytes()[12] == int(name.partition("_sector")[2] or 1) for path in (HERE / name / "sectors").iterdir())
+
+
+def test_harmonics_of_before_are_refused_by_name():
+    opened = Dataset.open(HERE / REFUSED)
+    with pytest.raises(FormatVersionError, match=r"-1_0\.gisec: format version 1 in harmonics.*reads version 2; bake the dataset again"):
+        opened.sector(min(opened.world.sectors))
 
 
 @pytest.mark.parametrize("path", SECTORS, ids=name_of)
@@ -128,7 +141,7 @@ def test_fine_voxels_read_from_format_md_alone_are_the_voxels(path):
     assert (voxels.weight.sum(axis=3) > 0).any()
 
 
-@each_version
+@each_folder
 def test_distant_texels_read_from_format_md_alone_are_the_texels(golden):
     meta, expected = reader.read_distant((golden / "distant.gidist").read_bytes())
     texels, bake_id = distant_file.read(golden / "distant.gidist")
@@ -149,7 +162,7 @@ def test_distant_transfers_read_from_format_md_alone_are_the_transfers():
     assert digest == DISTANT_V2_DIGEST
 
 
-@each_version
+@each_read
 def test_world_json_agrees_with_the_files_it_names(golden):
     world = json.loads((golden / "world.json").read_bytes())
     assert {f"{x},{z}" for x, z in ((-1, 0), (0, 0))} == set(world["sectors"])
@@ -189,10 +202,10 @@ def test_patches_of_the_sky_are_where_format_md_says(patches):
     assert found.tolist() == [reader.patch_at(patches, *one) for one in direction.tolist()]
 
 
-@pytest.mark.parametrize("version", DIGESTS)
-def test_what_a_version_holds_has_not_changed(version):
+@each_read
+def test_what_a_version_holds_has_not_changed(golden):
     """The digest is over decoded integers and bit patterns of floats: decoding uses only IEEE operations that round one way."""
-    opened = Dataset.open(HERE / f"v{version}")
+    opened = Dataset.open(golden)
     h = hashlib.blake2b(digest_size=16)
     for index in sorted(opened.world.sectors):
         sector, geometry = opened.sector(index), opened.geometry(index)
@@ -206,10 +219,10 @@ def test_what_a_version_holds_has_not_changed(version):
     texels = opened.distant()
     h.update(texels.sky.tobytes() + texels.valid.tobytes())
     h.update(json.dumps(opened.world.to_json(), sort_keys=True).encode())
-    assert h.hexdigest() == DIGESTS[version]
+    assert h.hexdigest() == DIGESTS[golden.name]
 
 
-@each_version
+@each_read
 def test_the_golden_dataset_still_lights_a_street(golden):
     engine = Engine(Dataset.open(golden))
     volume = engine.volume(np.array([5.0, 2.0, 30.0]), engine.lighting("12:00", "clear"), basis="cube")
@@ -219,13 +232,16 @@ def test_the_golden_dataset_still_lights_a_street(golden):
     assert 5e3 < float(np.median(volume.values[2, ..., 1])) < 5e4
 
 
-@each_version
-def test_a_dataset_made_today_is_described_by_format_md(tmp_path, golden):
+@pytest.mark.parametrize(
+    ("version", "like"), [(1, "v4_sector2"), (2, "v2_sector2"), (3, "v4_sector2"), (4, "v4_sector2"), (5, "v5_sector2")]
+)
+def test_a_dataset_made_today_is_described_by_format_md(tmp_path, version, like):
     make = neighbour("make_golden")
-    settings = {"v2": make.SETTINGS_V2, "v3": make.SETTINGS_V3}.get(golden.name, make.SETTINGS)
-    scene = {"v4": make.scene_v4, "v5": make.scene_v5}.get(golden.name, make.tiny_scene)()
+    settings = {2: make.SETTINGS_V2, 3: make.SETTINGS_V3}.get(version, make.SETTINGS)
+    scene = {4: make.scene_v4, 5: make.scene_v5}.get(version, make.tiny_scene)()
     world = make.write_golden(tmp_path, settings, scene)
-    assert json.loads((tmp_path / "world.json").read_bytes())["version"] == int(golden.name[1:])
+    assert json.loads((tmp_path / "world.json").read_bytes())["version"] == version
+    golden = HERE / like
     opened = Dataset.open(tmp_path)
     for index in world.sectors:
         path = opened.sector_path(index)
@@ -240,9 +256,9 @@ def test_a_dataset_made_today_is_described_by_format_md(tmp_path, golden):
         if opened.world.has_fine_voxels:
             fine = dataset.fine_path(tmp_path, index)
             np.testing.assert_array_equal(reader.read_fine(fine.read_bytes())[1]["probe"], opened.fine_voxels(sector).probe)
-            assert stored_arrays(fine) == stored_arrays(golden / "fine" / fine.name)
+            assert stored_arrays(fine) == stored_arrays(HERE / "v3" / "fine" / fine.name)
     assert stored_arrays(tmp_path / "distant.gidist") == stored_arrays(DISTANT_V2)
-    assert stored_arrays(golden / "distant.gidist") < stored_arrays(DISTANT_V2)
+    assert stored_arrays(HERE / "v1" / "distant.gidist") < stored_arrays(DISTANT_V2)
 
 
 def test_the_hexdump_in_format_md_is_the_golden_sector():

@@ -37,9 +37,9 @@ def closed_white_room(make_sector, seed: int, **sizes):
     """Every probe sees surfels only, and each reflects all that a surface may: the loop loses no more than it must."""
     sector = make_sector(seed, **sizes)
     bricks_only = np.where(sector.factor_source >= sector.brick_count, 0, sector.factor_source).astype(np.uint32)
-    code, scale = factor_weights.encode(sector.factor_weight, sector.factor_starts, np.zeros(sector.factor_count, bool))
+    codes = factor_weights.encode(sector.factor_weight, sector.factor_starts, np.zeros(sector.factor_count, bool))
     white = np.full_like(sector.surfel_albedo, 0.95)
-    return replace(sector, factor_source=bricks_only, factor_code=code, factor_scale=scale, surfel_albedo=white)
+    return replace(sector, factor_source=bricks_only, **codes._asdict(), surfel_albedo=white)
 
 
 def run(resident: ResidentSector, given: RelightInput, ticks: int) -> np.ndarray:
