@@ -18,6 +18,8 @@ from gi_core.grid import SectorIndex
 from gi_core.sector import Sector, check_sector, counts, starts
 
 KIND = "SECT"
+# Such bakes take seconds: 4 % less for a twentieth more of them. Level 19 saves 1 % more and takes twice as long.
+HARMONICS_LEVEL = 16
 VERSION = 2
 VERSIONS = (1, 2)
 NO_PROBE = 0xFFFF
@@ -96,7 +98,9 @@ def encode(sector: Sector, meta: dict[str, Any], sky_patches: int) -> bytes:
         "bake": meta,
     }
     delta = frozenset({"probe_position", "factor_source", "brick_cell", "voxel_probe"})
-    return container.encode(KIND, VERSION, full_meta, arrays, delta)
+    return container.encode(
+        KIND, VERSION, full_meta, arrays, delta, container.ZSTD_LEVEL if s.basis_size == BASIS_SIZES["cube"] else HARMONICS_LEVEL
+    )
 
 
 def decode(data: bytes, where: str) -> tuple[Sector, dict[str, Any]]:

@@ -105,6 +105,7 @@ def test_chart_bars_are_logarithmic():
     assert first[0] - second[0] == pytest.approx((CHART_SIZE[1] - 100) / math.log10(10 / 0.001), abs=1.5)
 
 
+@pytest.mark.slow
 def test_the_confidence_interval_holds_the_true_median_and_narrows_with_more_points():
     """Errors drawn from a known distribution, many times: the interval misses its median as seldom as it says."""
     rng, widths = np.random.default_rng(1), {}

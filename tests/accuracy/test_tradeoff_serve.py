@@ -12,6 +12,9 @@ from bake_jobs.tradeoff_report import table
 from bake_jobs.tradeoff_serve import PASSES, with_serving
 from gi_core.constants import VOLUME_SHAPE
 
+# A sweep of bakes takes a dozen seconds.
+pytestmark = pytest.mark.slow
+
 SOURCE = "procedural:midtown?blocks=1x1&seed=1"
 COLOURS = int(np.prod(VOLUME_SHAPE))
 

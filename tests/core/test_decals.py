@@ -61,6 +61,7 @@ def test_the_texture_is_the_gradient():
     assert (np.diff(texels) <= 0).all()
 
 
+@pytest.mark.slow
 def test_a_parked_car_hides_about_what_rays_say():
     x, z = (axis.ravel() for axis in np.meshgrid(np.linspace(0, 6, 25), np.linspace(0, 8, 33)))
     points = on_ground(x, z)

@@ -279,6 +279,7 @@ def test_a_stream_of_a_world_that_stands_still_is_silent(live_http: httpx.Client
         assert received(connection, 3.0) <= 2
 
 
+@pytest.mark.slow
 def test_a_stream_of_a_world_at_its_own_pace_takes_next_to_nothing(live_http: httpx.Client, player: str) -> None:
     """For who stands under a clear sky at noon whose sun moves as the sun does: 0.0004 Mbit/s were seen."""
     live_http.put("/v1/weather", json={"weather": "clear"})
@@ -321,7 +322,10 @@ def test_a_client_that_vanishes_is_forgotten(live_http: httpx.Client, player: st
     until(lambda: streams.clients == 0)
 
 
-def test_a_thousand_clients_come_and_go_without_a_trace(live_http: httpx.Client, player: str, racing: None, streams: PlayerStreams) -> None:
+@pytest.mark.parametrize("clients", [150, pytest.param(1000, marks=pytest.mark.slow)])
+def test_a_thousand_clients_come_and_go_without_a_trace(
+    live_http: httpx.Client, player: str, racing: None, streams: PlayerStreams, clients: int
+) -> None:
     """They connect, take something and leave, in turns politely and not; no encoder, descriptor or memory of theirs is left."""
 
     def come(times: int) -> None:
@@ -344,7 +348,7 @@ def test_a_thousand_clients_come_and_go_without_a_trace(live_http: httpx.Client,
     _, descriptors = left()
     memory = memory_bytes()
     assert memory is not None
-    come(1000)
+    come(clients)
     # A connection or two of the test's own client may come or go meanwhile.
     until(lambda: left()[0] == 0 and left()[1] <= descriptors + 2)
     assert (memory_bytes() or 0) - memory < MOST_GROWTH_BYTES
