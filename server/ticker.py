@@ -33,8 +33,8 @@ from server.tick_stats import TickStats
 
 log = logging.getLogger("sectorlight.ticker")
 
-# Of a tick's time; then volumes wait for the next.
-FILL_UNTIL = 0.6
+# Of a tick's time; then volumes wait for the next. With 0.6 fifty players had twice as many late ticks and 2 % more frames.
+FILL_UNTIL = 0.4
 
 Listener = Callable[[TickReport], None]
 
