@@ -66,6 +66,7 @@ def test_suns_stand_where_they_are_said_to_and_off_the_tables_nodes():
         assert np.degrees(np.arccos(np.clip(nodes @ now, -1, 1))).min() > 1.5
 
 
+@pytest.mark.slow
 def test_a_city_is_compared_and_the_map_beats_the_table(tmp_path):
     from bake_jobs.runner import bake
 

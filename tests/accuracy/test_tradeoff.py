@@ -96,6 +96,7 @@ def test_the_middle_of_a_city_is_swept():
     assert z0 < centre[2] < z1
 
 
+@pytest.mark.slow
 def test_a_sweep_keeps_its_rows_and_goes_on_from_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     sweep = Sweep(SOURCE, load_scene(SOURCE), ((0, 1), (0, 1)), ("noon",), points=3, samples=16)
     said: list[str] = []

@@ -91,6 +91,7 @@ def test_margin_probes_are_the_neighbours_own(west_and_east):
     assert strips[0] == strips[1]
 
 
+@pytest.mark.slow
 def test_no_seam_shows(west_and_east):
     """Steps between voxels on both sides of the border are no higher than those of the light itself."""
     bench, _ = west_and_east

@@ -342,6 +342,7 @@ def test_a_target_error_is_estimated_for_every_sector_and_misses_are_named(sourc
     assert "--quality standard" in text
 
 
+@pytest.mark.slow
 def test_the_same_bake_once_more_keeps_its_error_report_and_any_other_drops_it(source, tmp_path):
     def reported(report):
         write_world(tmp_path, dataclasses.replace(Dataset.open(tmp_path).world, error_report=report))

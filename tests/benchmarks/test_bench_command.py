@@ -21,6 +21,7 @@ NAMES = [*RELIGHT, "relight_host", "volume_fill", "volume_step", "sector_decode"
 UNITS = [*["ms"] * 9, "s", *["us"] * 6, "requests/s"]
 
 
+@pytest.mark.slow
 def test_a_quick_run_has_every_row_beside_its_baseline(tmp_path: Path) -> None:
     command = [sys.executable, "-c", "from server.cli import main; main()", "bench", "--quick", "--json", str(tmp_path / "out.json")]
     done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=200)
