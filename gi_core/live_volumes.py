@@ -54,8 +54,7 @@ class LiveVolumes:
     @property
     def missing(self) -> tuple[SectorIndex, ...]:
         """Sectors that published volumes read and that are not there, or not lit yet."""
-        residents = self._residents
-        return tuple(index for index in self.looked_at if index not in residents or not residents[index].is_lit)
+        return tuple(index for index in self.looked_at if not self._is_lit(index))
 
     def note(self, tick: int, ids: Sequence[str], positions: Float64, changed: Sequence[SectorIndex]) -> None:
         """Find what has to be filled: for players ``ids`` (p) at positions (p, 3) [m], and sectors that show something else now."""

@@ -17,11 +17,16 @@ from gi_core.shadow_plan import MovingBox, box_axes
 from gi_core.volume import box_slices, plan_boxes, sector_slices
 
 
-def boxes_in_reach(boxes: Iterable[MovingBox], first_voxel: Int64) -> tuple[MovingBox, ...]:
+def boxes_in_reach(boxes: Sequence[MovingBox], first_voxel: Int64) -> tuple[MovingBox, ...]:
     """Those that may touch a volume whose voxel (0, 0, 0) has the lattice index ``first_voxel`` (3,)."""
+    if not boxes:
+        return ()
     low = first_voxel * VOXEL_SIZE_M
     high = low + VOXEL_SIZE_M * np.array(VOLUME_SHAPE)[[2, 0, 1]]
-    return tuple(box for box in boxes if np.linalg.norm(box.position - np.clip(box.position, low, high)) <= _radius(box))
+    position = np.array([box.position for box in boxes])
+    away = np.linalg.norm(position - np.clip(position, low, high), axis=1)
+    near = away <= np.linalg.norm([box.half_size for box in boxes], axis=1)
+    return tuple(box for box, is_near in zip(boxes, near.tolist(), strict=True) if is_near)
 
 
 def stale_share(
@@ -60,7 +65,7 @@ def _crossed(start: Float64, way: Float64, boxes: Sequence[MovingBox], origin: F
     middle, reach = start + way / 2, np.linalg.norm(way, axis=1) / 2
     for box, axes in zip(boxes, box_axes(boxes), strict=True):
         place = np.asarray(box.position) - origin
-        near = np.flatnonzero((np.abs(middle - place).max(axis=1) <= reach + _radius(box)) & ~crossed)
+        near = np.flatnonzero((np.abs(middle - place).max(axis=1) <= reach + np.linalg.norm(box.half_size)) & ~crossed)
         at, step, half = (start[near] - place) @ axes.T, way[near] @ axes.T, np.asarray(box.half_size)
         with np.errstate(divide="ignore", invalid="ignore"):
             sides = np.stack([(-half - at) / step, (half - at) / step])
@@ -70,7 +75,3 @@ def _crossed(start: Float64, way: Float64, boxes: Sequence[MovingBox], origin: F
         leave = np.where(still, np.where(inside, np.inf, -np.inf), sides.max(axis=0)).min(axis=1)
         crossed[near] = (enter <= leave) & (leave >= 0) & (enter <= 1)
     return crossed
-
-
-def _radius(box: MovingBox) -> float:
-    return float(np.linalg.norm(box.half_size))
