@@ -151,11 +151,9 @@ class LiveSector:
         """Take samples of a shadow map that was just drawn; they light the sector at its next relight."""
         self.make_room_for_samples()
         assert self.samples is not None
-        before, now = self.sampled_of, shadow_map.plan
-        assert now is not None
         shadow_map.sample(self.samples)
-        self.sampled_of = now
-        self.has_other_source |= before is None or not self._is_whole_in(before) or not self._is_whole_in(now)
+        self.has_other_source |= self.sampled_of is None
+        self.sampled_of = shadow_map.plan
 
     def drop_sun_samples(self) -> None:
         """Back to the bake's visibility, with no room for samples: the sun has set."""
@@ -301,15 +299,10 @@ class LiveSector:
         elif samples.forget_old(light.to_sun):
             if samples.are_there:
                 self.resident.set_sun_sample(samples.sun_sample)
-                self.has_other_source |= not self._is_whole_in(of)
             else:
                 self.sampled_of = None
                 self.resident.set_sun_sample(None)
                 self.has_other_source = is_near(of.to_sun, light.to_sun, SUN_JUMPED_DEGREES)
-
-    def _is_whole_in(self, plan: ShadowPlan) -> bool:
-        """Whether at most far surfels, which stand on others' ground, lack samples of a map: what they change is not seen."""
-        return plan.covers_whole(self.resident.sector.index)
 
 
 def fade_ticks(before: Float32, after: Float32) -> int:

@@ -13,14 +13,13 @@ from gi_core.constants import SECTOR_SIZE_M
 from gi_core.dataset import Dataset
 from gi_core.device import Device
 from gi_core.errors import SectorlightError
-from gi_core.grid import SectorIndex, volume_first_voxel
+from gi_core.grid import SectorIndex
 from gi_core.layout import SHADOW_TRIANGLE
 from gi_core.live_sector import LiveLight, LiveSector
 from gi_core.shadow_map import ShadowMap
 from gi_core.shadow_plan import (
-    MAP_TEXELS,
+    HALF_MAP_M,
     NO_BOXES,
-    TEXELS_PER_METRE,
     MovingBox,
     ShadowPlan,
     box_corners,
@@ -29,15 +28,18 @@ from gi_core.shadow_plan import (
     plan_map,
     sun_or_box_moved,
 )
-from gi_core.volume import plan_boxes
 
 log = logging.getLogger("sectorlight.shadows")
 
-# Of one tick: half a millisecond each on two cores.
+# Of one tick: half a millisecond each on two cores. For every so many players as much again, so that maps keep up with those who walk: a
+# sector that is sampled in time need not fade, and whoever reads it need not be filled while it does.
 TRIANGLES_PER_TICK = 1000
 SECTORS_SAMPLED_PER_TICK = 2
+PLAYERS_PER_SHARE, MOST_SHARES = 10, 6
 # Where many walk, the next tick looks at others.
 PLAYERS_LOOKED_AT_PER_TICK = 4
+# Sectors with ground this near to a player, along x and z, lie whole in a map around it, whose middle is rounded to texels.
+NEAR_M = HALF_MAP_M - SECTOR_SIZE_M - 1.0
 # Triangles of sectors towards the sun that are kept in memory, 48 bytes each.
 KEPT_BYTES = 1 << 26
 
@@ -47,8 +49,9 @@ Casters = Mapping[SectorIndex, AnyArray]
 class LiveShadows:
     """Decides what the map shows and when; the ticker's alone. A thread of its own plans maps and reads geometry.
 
-    A sector's samples hold wherever players go: they are taken anew when the sun or a box has moved, and when a sector that lay half in
-    a map lies whole in another. So a map is drawn only when some player's volume reads a sector whose samples are missing or old.
+    Only sectors whose own ground lies whole in a map are sampled. Their samples hold wherever players go, and are taken anew when the sun
+    or a box has moved: so a map is drawn only when a sector near some player has none, or old ones. Near is farther than the player's
+    volume reads: a sector that a walker comes to is sampled before anybody sees it, and need not fade.
     """
 
     def __init__(self, device: Device, dataset: Dataset) -> None:
@@ -89,19 +92,21 @@ class LiveShadows:
                 sector.drop_sun_samples()
             return tuple(residents)
         self._dark = False
+        shares = min(1 + len(positions) // PLAYERS_PER_SHARE, MOST_SHARES)
         plan = self._map.plan
         if self._to_sample and plan is not None and is_near(plan.to_sun, light.to_sun):
-            some = self._to_sample[:SECTORS_SAMPLED_PER_TICK]
-            del self._to_sample[:SECTORS_SAMPLED_PER_TICK]
-            chosen = tuple(index for index in some if index in residents and wants_samples(residents[index], index, plan))
+            some = self._to_sample[: shares * SECTORS_SAMPLED_PER_TICK]
+            del self._to_sample[: shares * SECTORS_SAMPLED_PER_TICK]
+            chosen = tuple(i for i in some if i in residents and lacks_samples(residents[i], plan.to_sun, plan.boxes))
             for index in chosen:
                 residents[index].sample_sun(self._map)
             return chosen
         # A map for a sun that has moved away, as it does when the clock jumps, is given up for another.
         drawing = self._map.drawing
         if drawing is not None and is_near(drawing.to_sun, light.to_sun):
-            if self._map.draw(TRIANGLES_PER_TICK):
-                self._to_sample = list(covered(self._map.plan, residents))
+            if self._map.draw(shares * TRIANGLES_PER_TICK):
+                assert self._map.plan is not None
+                self._to_sample = covered(self._map.plan, residents)
         elif self._planning is not None:
             if self._planning.done():
                 plan, casters = self._planning.result()
@@ -116,12 +121,11 @@ class LiveShadows:
         return ()
 
     def _plan(self, positions: Float64, to_sun: Float64, boxes: Float64, residents: Mapping[SectorIndex, LiveSector]) -> None:
-        """Plan a map for the next player, in turn, whose volume reads a sector that lacks samples."""
+        """Plan a map for the next player, in turn, that is near a sector which lacks samples."""
         count = len(positions)
         for offset in range(min(count, PLAYERS_LOOKED_AT_PER_TICK)):
             player = (self._turn + offset) % count
-            touched = (box.index for box in plan_boxes(volume_first_voxel(positions[player])))
-            here = [index for index in touched if index in residents]
+            here = sectors_within(NEAR_M, positions[player], residents)
             if any(lacks_samples(residents[index], to_sun, boxes) for index in here):
                 self._turn = player + 1
                 self._planning = self._planner.submit(self._prepare, positions[player].copy(), to_sun, boxes)
@@ -167,28 +171,24 @@ class LiveShadows:
 
 
 def lacks_samples(sector: LiveSector, to_sun: Float64, boxes: Float64) -> bool:
-    """Whether a sector that a volume reads has no samples, or old ones: the sun or a box has moved since."""
+    """Whether a sector has no samples, or old ones: the sun or a box has moved since."""
     of = sector.sampled_of
     return of is None or sun_or_box_moved(of, to_sun, boxes)
 
 
-def wants_samples(sector: LiveSector, index: SectorIndex, plan: ShadowPlan) -> bool:
-    """Whether a map says more of a sector than its samples do."""
-    of = sector.sampled_of
-    if of is None or sun_or_box_moved(of, plan.to_sun, plan.boxes):
-        return True
-    return plan.covers_whole(index) and not of.covers_whole(index)
-
-
-def covered(plan: ShadowPlan | None, sectors: Collection[SectorIndex]) -> tuple[SectorIndex, ...]:
-    """Sectors on some of whose own ground a map may look, nearest first; a sector's far surfels are others' ground."""
-    if plan is None:
-        return ()
-    half_map = MAP_TEXELS / TEXELS_PER_METRE / 2
-    (x0, z0), (x1, z1) = (np.floor((plan.middle[[0, 2]] + side * half_map) / SECTOR_SIZE_M).astype(int).tolist() for side in (-1, 1))
-    near = (SectorIndex(x, z) for x in range(x0, x1 + 1) for z in range(z0, z1 + 1))
+def covered(plan: ShadowPlan, sectors: Collection[SectorIndex]) -> list[SectorIndex]:
+    """Sectors whose own ground lies whole in a map, nearest first; a sector's far surfels are others' ground."""
 
     def away(index: SectorIndex) -> float:
         return float(np.abs((index.origin + SECTOR_SIZE_M / 2 - plan.middle)[[0, 2]]).max())
 
-    return tuple(sorted((index for index in near if index in sectors), key=lambda index: (away(index), index)))
+    near = sectors_within(HALF_MAP_M, plan.middle, sectors)
+    return sorted((index for index in near if plan.covers_whole(index)), key=lambda index: (away(index), index))
+
+
+def sectors_within(distance_m: float, position: Float64, sectors: Collection[SectorIndex]) -> list[SectorIndex]:
+    """Those of ``sectors`` with ground less than a distance away from a position (3,) [m] along x and z both."""
+    x0, z0 = np.floor((position[[0, 2]] - distance_m) / SECTOR_SIZE_M).astype(int).tolist()
+    x1, z1 = np.floor((position[[0, 2]] + distance_m) / SECTOR_SIZE_M).astype(int).tolist()
+    around = (SectorIndex(x, z) for x in range(x0, x1 + 1) for z in range(z0, z1 + 1))
+    return [index for index in around if index in sectors]

@@ -15,6 +15,7 @@ from gi_core.layout import SHADOW_FRAME, SHADOW_TRIANGLE
 # 256 m across, so that all of a 100 m volume and the streets around it are inside; texels a quarter of a surfel's cell.
 MAP_TEXELS = 1024
 TEXELS_PER_METRE = 4.0
+HALF_MAP_M = MAP_TEXELS / TEXELS_PER_METRE / 2
 # Geometry up to this far towards the sun is drawn [m]: beyond, a surfel's ray must be above the city or the baked visibility is used. Far
 # enough for towers of 500 m and a sun at 5 degrees, whose baked visibility is the worst.
 MAX_REACH_M = 6000.0
@@ -76,7 +77,7 @@ class ShadowPlan:
     def covers_whole(self, index: SectorIndex) -> bool:
         """Whether a sector's own ground lies in the map as far as its level extent goes."""
         away = np.abs((index.origin + SECTOR_SIZE_M / 2 - self.middle)[[0, 2]]).max()
-        return bool(away + SECTOR_SIZE_M / 2 <= MAP_TEXELS / TEXELS_PER_METRE / 2)
+        return bool(away + SECTOR_SIZE_M / 2 <= HALF_MAP_M)
 
 
 def plan_map(
@@ -107,7 +108,7 @@ def _sectors_towards_sun(
     middle: Float64, to_sun: Float64, axes: Float64, sectors: Collection[SectorIndex], heights: tuple[float, float], reach: float
 ) -> tuple[SectorIndex, ...]:
     """Sectors whose columns meet the map's prism within the reach, in grid order."""
-    half = MAP_TEXELS / TEXELS_PER_METRE / 2
+    half = HALF_MAP_M
     # No point of the map's receivers is further from its middle than its diagonal and the city's height allow.
     radius = half * math.sqrt(2) + SECTOR_SIZE_M + reach + (heights[1] - heights[0])
     x0, z0 = np.floor((middle[[0, 2]] - radius) / SECTOR_SIZE_M).astype(int)

@@ -675,6 +675,22 @@ def test_nothing_pops_on_a_walk_when_the_shadow_map_takes_over(shaded, engine):
     assert 0.5 * FADE_STEP <= largest <= 1.5 * max(FADE_STEP, whole_way / FADE_TICKS)
 
 
+def test_a_sector_has_samples_before_a_walker_sees_it(engine):
+    world = LiveWorld(Dataset.open(GOLDEN))
+    try:
+        run, light = Run(world), light_of(world, engine.lighting("15:00", "clear"), standing=False)
+        coming = [STREET + EAST * x for x in np.arange(48.0, 40.0, -0.25)]
+        residents = world.streamer.residents
+        run.until(at(coming[0]), light, lambda r: sampled(world) and not any(s.is_fading or s.has_other_source for s in residents.values()))
+        assert len(world.volumes.looked_at) == 1
+        for place in coming:
+            run.tick(at(place, velocity=-5 * EAST), light)
+            assert not any(residents[index].is_fading for index in world.volumes.looked_at)
+        assert len(world.volumes.looked_at) == 2
+    finally:
+        world.close()
+
+
 def test_nothing_pops_when_samples_grow_too_old(shaded, engine, monkeypatch):
     world, may_read = shaded
     may_read.set()

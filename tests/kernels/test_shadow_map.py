@@ -9,6 +9,7 @@ from gi_core import shadow_map_twin
 from gi_core.device import Device, available_devices, describe, shared_device
 from gi_core.grid import SectorIndex
 from gi_core.layout import NO_SAMPLE, WHOLE_SAMPLE
+from gi_core.live_shadows import NEAR_M, sectors_within
 from gi_core.resident_sector import ResidentSector
 from gi_core.shadow_map import LAST_NUMBER, ShadowMap, SunSamples
 from gi_core.shadow_plan import (
@@ -306,3 +307,17 @@ def test_seventy_kilometres_from_the_origin_samples_are_the_same(device, make_se
     np.testing.assert_array_equal(found[1][0], found[0][0])
     np.testing.assert_array_equal(found[1][1], found[0][1])
     assert 0.02 < (found[0][0] == WHOLE_SAMPLE).mean() < 0.9
+
+
+def test_sectors_near_a_player_are_whole_in_its_map():
+    """Else a map would be drawn for such a sector again and again."""
+    rng = np.random.default_rng(5)
+    around = {SectorIndex(x, z) for x in range(-6, 6) for z in range(-6, 6)}
+    counts = set()
+    for _ in range(300):
+        place = rng.uniform(-200, 200, 3)
+        plan = plan_map(place, towards(rng.uniform(2, 90), rng.uniform(0, 360)), around, 0.0, TOP)
+        near = sectors_within(NEAR_M, place, around)
+        assert all(plan.covers_whole(index) for index in near)
+        counts.add(len(near))
+    assert {6, 9} <= counts <= {4, 6, 9}
