@@ -3,12 +3,12 @@
 from dataclasses import replace
 
 import numpy as np
-from scipy.ndimage import find_objects, label
+from scipy.ndimage import find_objects, label, uniform_filter
 
 from bake_jobs.rays import RayScene
 from gi_core.arrays import Bool, Float64, Int32, Int64
 from gi_core.constants import ROOM_CELL_M, ROOM_OUTDOORS
-from gi_core.rooms import rooms_of
+from gi_core.rooms import air_of, rooms_of
 from gi_core.world import Opening, Room
 
 # An author's box may end before its walls or in them: a way from this far inside it to this far outside it, past walls of common depth.
@@ -19,13 +19,18 @@ SEAM_M = 2 * ROOM_CELL_M
 RIM_DEPTH_M = 0.05
 # What begins lower above a room's floor is a door, whatever its sill.
 SILL_M = 0.5
+# Of a slanted wall's cells, those faces are looked through that it turns to; along the others one would look along it.
+_FACING, _FACING_CELLS = 0.5, 5
 # From a cell beside a wall to the wall.
 _NEAR_CELLS = 1.5
 
 
 def authored_openings(rays: RayScene, rooms: tuple[Room, ...]) -> tuple[Room, ...]:
-    """Rooms with the openings in the six faces of each one's box: rectangles that nothing closes and that lead to no other room."""
-    return tuple(replace(room, openings=tuple(_face_openings(rays, room, rooms))) for room in rooms)
+    """Rooms with their openings, of a box in its six faces, of a mesh between cells: what nothing closes and leads to no other room."""
+    return tuple(
+        replace(room, openings=tuple(_face_openings(rays, room, rooms)) if room.cells is None else _mesh_openings(rays, room, rooms))
+        for room in rooms
+    )
 
 
 def _face_openings(rays: RayScene, room: Room, rooms: tuple[Room, ...]) -> list[Opening]:
@@ -55,6 +60,36 @@ def _face_openings(rays: RayScene, room: Room, rooms: tuple[Room, ...]) -> list[
     return found
 
 
+def _mesh_openings(rays: RayScene, room: Room, rooms: tuple[Room, ...]) -> tuple[Opening, ...]:
+    """Openings of a room in cells, looked for as those of a box: from a little inside each face of its air to a little outside."""
+    assert room.cells is not None
+    cell_m, margin = room.cells.size_m, _FACING_CELLS // 2 + 1
+    air = np.pad(air_of(room.cells), margin)
+    first = np.array(room.cells.first) - margin
+    low, high = np.array(room.minimum), np.array(room.maximum)
+    density = uniform_filter(air.astype(np.float32), _FACING_CELLS)
+    cuts = []
+    for axis in range(3):
+        own, along = np.moveaxis(air, axis, 0), (1, 2, 0)[axis]
+        cut = np.ones((len(own) - 1, *own.shape[1:]), np.bool_)
+        for here, there, sign in ((slice(1, None), slice(None, -1), -1.0), (slice(None, -1), slice(1, None), 1.0)):
+            face = np.moveaxis(np.zeros_like(air), axis, 0)
+            face[here] = own[here] & ~own[there]
+            at = np.argwhere(np.moveaxis(face, 0, axis))
+            slope = [density[tuple((at + step).T)] - density[tuple((at - step).T)] for step in np.eye(3, dtype=np.int64)]
+            at = at[-sign * slope[axis] > _FACING * np.linalg.norm(slope, axis=0)]
+            middle = (at[:, [2, 0, 1]] + first + 0.5) * cell_m
+            middle[:, along] = np.clip(middle[:, along] + sign * cell_m / 2, low[along], high[along])
+            way = np.zeros(3)
+            way[along] = sign
+            blocked = rays.occluded(middle - INSIDE_M * way, np.tile(way, (len(at), 1)), np.full(len(at), INSIDE_M + OUTSIDE_M))
+            is_open = ~blocked & (rooms_of(middle + OUTSIDE_M * way, rooms) == ROOM_OUTDOORS)
+            link = np.moveaxis(at[is_open], 1, 0)[[axis, *(other for other in range(3) if other != axis)]]
+            cut[link[0] - (sign < 0), link[1], link[2]] = False
+        cuts.append(np.moveaxis(cut, 0, axis))
+    return opening_boxes(rays, np.where(air, np.int32(1), np.int32(2)), 1, {1}, tuple(cuts), first, low, high, cell_m)
+
+
 def _to_rim(rays: RayScene, ends: tuple[Float64, Float64], room: tuple[Float64, Float64], axis: int, outward: float) -> Opening:
     """An opening that was found in cells, as wide as it is: to what its middle meets, a little way into the wall, around it.
 
@@ -66,13 +101,16 @@ def _to_rim(rays: RayScene, ends: tuple[Float64, Float64], room: tuple[Float64, 
     side = room[1 if outward > 0 else 0][axis]
     if max(abs(low[axis] - side), abs(high[axis] - side)) <= SEAM_M:
         low[axis] = high[axis] = side
-    middle = (low + high) / 2
-    middle[axis] += outward * RIM_DEPTH_M
+    # Of faces between cells the wall that they stand for begins up to half a cell to either side.
+    depths = np.array([RIM_DEPTH_M] if low[axis] == side else [-0.15, -0.05, RIM_DEPTH_M, 0.15, 0.25])
+    middle = np.tile((low + high) / 2, (len(depths), 1))
+    middle[:, axis] += outward * depths
     for across in (other for other in range(3) if other != axis):
         for edge, sign in ((low, -1.0), (high, 1.0)):
-            way = np.zeros((1, 3))
-            way[0, across] = sign
-            rim = middle[across] + sign * float(rays.closest(middle[None], way).distance[0])
+            way = np.zeros(3)
+            way[across] = sign
+            distance = rays.closest(middle, np.tile(way, (len(depths), 1))).distance
+            rim = middle[0, across] + sign * float(distance.min())
             if abs(rim - edge[across]) <= ROOM_CELL_M:
                 edge[across] = round(rim, 4)
     if axis != 1 and low[1] < room[0][1] + SILL_M:
@@ -81,7 +119,15 @@ def _to_rim(rays: RayScene, ends: tuple[Float64, Float64], room: tuple[Float64, 
 
 
 def opening_boxes(
-    rays: RayScene, basin: Int32, number: int, rooms: set[int], cuts: tuple[Bool, ...], first: Int64, low: Float64, high: Float64
+    rays: RayScene,
+    basin: Int32,
+    number: int,
+    rooms: set[int],
+    cuts: tuple[Bool, ...],
+    first: Int64,
+    low: Float64,
+    high: Float64,
+    cell_m: float = ROOM_CELL_M,
 ) -> tuple[Opening, ...]:
     """Where cells (ny, nz, nx) of a number meet, with nothing between, those of others that are no rooms: a box for each group of faces.
 
@@ -99,7 +145,7 @@ def opening_boxes(
             for group in find_objects(groups):
                 start, stop = (np.array([getattr(part, end) for part in group], np.float64) for end in ("start", "stop"))
                 start[axis] += 1  # the face between cells i and i + 1 lies at i + 1
-                start, stop = (np.clip((end[[2, 0, 1]] + first) * ROOM_CELL_M, low, high) for end in (start, stop))
+                start, stop = (np.clip((end[[2, 0, 1]] + first) * cell_m, low, high) for end in (start, stop))
                 boxes.append(_to_rim(rays, (start, stop), (low, high), (1, 2, 0)[axis], outward))
     return _outermost(boxes)
 

@@ -99,15 +99,26 @@ def rooms_of(position: Float64, rooms: tuple[Room, ...]) -> UInt16:
 
 
 def holds(room: Room, position: Float64, slack_m: float = 0.0) -> Bool:
-    """Which world positions (n, 3) [m] lie in a room, or up to ``slack_m`` (at most a cell's width) outside it."""
+    """Which world positions (n, 3) [m] lie in a room, or up to ``slack_m`` outside its box, and a cell outside its cells."""
     low, high = np.array(room.minimum) - slack_m, np.array(room.maximum) + slack_m
     inside: Bool = np.asarray(((position >= low) & (position <= high)).all(axis=1), np.bool_)
     if room.cells is not None and inside.any():
         # The box ends at walls, cells beside them: what lies between the two is the room's.
-        cell = np.floor(position[inside] / ROOM_CELL_M).astype(np.int64) - room.cells.first
-        x, y, z = np.clip(cell, 0, np.array(room.cells.shape) - 1).T
-        inside[inside] = _air(room.cells, slack_m > 0)[y, z, x]
+        last = np.array(room.cells.shape) - 1
+        cell = np.clip(np.floor(position[inside] / room.cells.size_m).astype(np.int64) - room.cells.first, 0, last)
+        steps = np.concatenate([np.eye(3, dtype=np.int64), -np.eye(3, dtype=np.int64)]) if slack_m > 0 else ()
+        held = _is_air(room.cells, cell)
+        for step in steps:
+            held |= _is_air(room.cells, np.clip(cell + step, 0, last))
+        inside[inside] = held
     return inside
+
+
+def _is_air(cells: RoomCells, at: Int64) -> Bool:
+    """Which cells (n, 3), x, y, z from the first, hold the room's air."""
+    nx, _, nz = cells.shape
+    index = (at[:, 1] * nz + at[:, 2]) * nx + at[:, 0]
+    return np.asarray(np.frombuffer(cells.bits, np.uint8)[index >> 3] >> (index & 7).astype(np.uint8) & 1, np.bool_)
 
 
 def indoor_shares(position: Float64, rooms: tuple[Room, ...], surface: Float64 | None = None) -> tuple[UInt16, Float32]:
@@ -193,27 +204,20 @@ def weight_lattice(first_voxel: Int64, rooms: tuple[Room, ...], numbers: tuple[i
     return found
 
 
-def pack_cells(at: Int64) -> RoomCells:
-    """The cells of a room, at least one, by their lattice indices (n, 3), x, y, z."""
+def pack_cells(at: Int64, size_m: float = ROOM_CELL_M) -> RoomCells:
+    """The cells of a room, at least one, by their lattice indices (n, 3), x, y, z; ``size_m`` is a cell's width [m]."""
     x, y, z = at.min(axis=0).tolist()
     nx, ny, nz = (np.ptp(at, axis=0) + 1).tolist()
     air = np.zeros((ny, nz, nx), np.bool_)
     air[tuple((at - [x, y, z]).T[[1, 2, 0]])] = True
-    return RoomCells((x, y, z), (nx, ny, nz), np.packbits(air.reshape(-1), bitorder="little").tobytes())
+    return RoomCells((x, y, z), (nx, ny, nz), np.packbits(air.reshape(-1), bitorder="little").tobytes(), size_m)
 
 
-@lru_cache(maxsize=1024)
-def _air(cells: RoomCells, grown: bool) -> Bool:
-    """Which cells (ny, nz, nx) hold the room's air; ``grown`` : or have one beside them that does."""
+def air_of(cells: RoomCells) -> Bool:
+    """Which cells (ny, nz, nx) hold the room's air."""
     nx, ny, nz = cells.shape
-    air = np.unpackbits(np.frombuffer(cells.bits, np.uint8), count=nx * ny * nz, bitorder="little").astype(np.bool_).reshape(ny, nz, nx)
-    if grown:
-        for axis in range(3):
-            beside = np.moveaxis(air.copy(), axis, 0)
-            air_along = np.moveaxis(air, axis, 0)
-            air_along[1:] |= beside[:-1]
-            air_along[:-1] |= beside[1:]
-    return air
+    bits = np.unpackbits(np.frombuffer(cells.bits, np.uint8), count=nx * ny * nz, bitorder="little")
+    return np.asarray(bits.astype(np.bool_).reshape(ny, nz, nx))
 
 
 def _reached(position: Float64, rooms: tuple[Room, ...], margin_m: float) -> list[int]:

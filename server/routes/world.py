@@ -80,7 +80,15 @@ def world_reply(dataset: Dataset) -> WorldReply:
 def room_reply(number: int, room: Room) -> RoomReply:
     """A room, and where its air meets the open air."""
     openings = [OpeningReply(minimum=opening.minimum, maximum=opening.maximum) for opening in room.openings]
-    return RoomReply(number=number, name=room.name, minimum=room.minimum, maximum=room.maximum, found=room.is_found, openings=openings)
+    return RoomReply(
+        number=number,
+        name=room.name,
+        minimum=room.minimum,
+        maximum=room.maximum,
+        shape="box" if room.cells is None else "cells",
+        found=room.is_found,
+        openings=openings,
+    )
 
 
 def sector_grid(info: WorldInfo) -> SectorGridReply:
