@@ -172,6 +172,9 @@ class PreviewQuery(LightingQuery):
         "on", description="off: direct light only; split: left off, right on; error: against a path tracer, in false colour"
     )
     distant: Beyond = Field("on", description="beyond the volumes: the distant texture, or off; client: beyond the eye's one volume")
+    distant_light: DistantLight | None = Field(
+        None, description="of the distant texture the sky's light alone, or with sun, lamps and bounces; none: the best that was baked"
+    )
     interior: Literal["on", "off"] = Field("on", description="off: rooms are lit by the outdoor volume, as without interior ones")
     ao: Literal["on", "off"] = Field("off", description="on: what stands within 3 m, and decals, dim indirect light")
     view: Literal["lit"] | ViewName = Field("lit", description="what lies behind the picture, in false colours or as spheres")
@@ -184,6 +187,8 @@ class PreviewQuery(LightingQuery):
 
     @model_validator(mode="after")
     def _one_kind(self) -> "PreviewQuery":
+        if self.distant_light is not None and self.distant == "off":
+            raise ValueError("distant_light with distant=on or client only")
         if self.gi == "error" and self.view != "lit":
             raise ValueError("either gi=error or another view than lit, not both")
         return self

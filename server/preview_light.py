@@ -18,6 +18,7 @@ from gi_core import ambient_cube
 from gi_core.arrays import Float32, Float64, Int64
 from gi_core.basis import average
 from gi_core.constants import ROOM_OUTDOORS, SECTOR_SIZE_M, VOLUME_SHAPE, VOXEL_SIZE_M
+from gi_core.distant_file import DistantLight
 from gi_core.engine import Distant, Engine
 from gi_core.errors import InputError
 from gi_core.lighting import Lighting
@@ -68,10 +69,17 @@ class ServedLight:
 
     @classmethod
     def of(
-        cls, engine: Engine, lighting: Lighting, settings: Settings, beyond: Beyond, eye: Float64, interior: bool = True
+        cls,
+        engine: Engine,
+        lighting: Lighting,
+        settings: Settings,
+        beyond: Beyond,
+        eye: Float64,
+        interior: bool = True,
+        distant_light: DistantLight | None = None,
     ) -> "ServedLight":
         """An engine's light under the artists' settings, seen from an eye (3,) [m]. Without ``interior`` volumes rooms are lit by the
-        outdoor one. Raises CorruptFileError."""
+        outdoor one; None of ``distant_light`` is the best that was baked. Raises InputError for one that was not, CorruptFileError."""
         low, high = engine.dataset.world.bounds
 
         def volume_at(position: Float64, room: int) -> Volume:
@@ -82,7 +90,7 @@ class ServedLight:
             except InputError:  # a closet between voxels, or out of the one volume's reach
                 return engine.volume(inside, lighting, settings)
 
-        distant = None if beyond == "off" else engine.distant(settings.light(lighting))
+        distant = None if beyond == "off" else engine.distant(settings.light(lighting), distant_light)
         world = engine.dataset.world
         return cls(volume_at, distant, eye if beyond == "client" else None, world.rooms if interior else (), world.decals)
 
