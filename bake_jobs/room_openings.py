@@ -1,4 +1,4 @@
-"""Where the air of rooms meets the open air: doors and windows, as boxes."""
+"""Where the air of rooms meets the open air or that of other rooms: doors and windows, as boxes."""
 
 from dataclasses import replace
 
@@ -15,6 +15,8 @@ from gi_core.world import Opening, Room
 INSIDE_M, OUTSIDE_M = 0.3, 0.6
 # A seam that follows cells may lie so far inside the room, and turn corners there.
 SEAM_M = 2 * ROOM_CELL_M
+# How finely a wall is looked through for where the room behind a door begins.
+THROUGH_STEP_M = 0.01
 # Rims are looked for so deep in a wall, of which the thinnest have 10 cm.
 RIM_DEPTH_M = 0.05
 # What begins lower above a room's floor is a door, whatever its sill.
@@ -25,15 +27,44 @@ _FACING, _FACING_CELLS = 0.5, 5
 _NEAR_CELLS = 1.5
 
 
-def authored_openings(rays: RayScene, rooms: tuple[Room, ...]) -> tuple[Room, ...]:
-    """Rooms with their openings, of a box in its six faces, of a mesh between cells: what nothing closes and leads to no other room."""
-    return tuple(
-        replace(room, openings=tuple(_face_openings(rays, room, rooms)) if room.cells is None else _mesh_openings(rays, room, rooms))
-        for room in rooms
-    )
+def with_openings(rays: RayScene, rooms: tuple[Room, ...]) -> tuple[Room, ...]:
+    """Rooms with their openings, what nothing closes: of a box in its six faces, of a mesh between cells. Found rooms have those to the
+    open air already. A door between two rooms is among the openings of both, as one box from either's side to the other's."""
+    seen = [
+        _face_openings(rays, number, rooms) if room.cells is None else _cell_openings(rays, number, rooms)
+        for number, room in enumerate(rooms, 1)
+    ]
+    doors: list[list[Opening]] = [[] for _ in rooms]
+    for one in range(1, len(rooms) + 1):
+        for other in sorted({opening.to for opening in seen[one - 1]} - {ROOM_OUTDOORS}):
+            back = [opening for opening in seen[other - 1] if opening.to == one]
+            if one < other or not back:
+                through = [_through(opening, rooms) for opening in seen[one - 1] if opening.to == other]
+                doors[one - 1] += through
+                doors[other - 1] += [replace(door, to=one) for door in through]
+    outdoors = [
+        room.openings if room.is_found else tuple(opening for opening in openings if opening.to == ROOM_OUTDOORS)
+        for room, openings in zip(rooms, seen, strict=True)
+    ]
+    return tuple(replace(room, openings=(*out, *within)) for room, out, within in zip(rooms, outdoors, doors, strict=True))
 
 
-def _face_openings(rays: RayScene, room: Room, rooms: tuple[Room, ...]) -> list[Opening]:
+def _beyond(rays: RayScene, number: int, rooms: tuple[Room, ...], faces: tuple[Float64, float], way: Float64) -> Int64:
+    """Which room, or 0, lies a little outside faces of a room's air; -1 of one that something closes, or that is in another room.
+
+    faces : middles (n, 3) [m], and how far inside them to begin [m]; way : (3,) outward
+    """
+    middle, inward = faces
+    starts = middle - inward * way
+    blocked = rays.occluded(starts, np.tile(way, (len(middle), 1)), np.full(len(middle), inward + OUTSIDE_M))
+    beyond = rooms_of(middle + OUTSIDE_M * way, rooms).astype(np.int64)
+    # Where rooms overlap the earlier one ends at its own faces, the other at those.
+    elsewhere = (beyond != ROOM_OUTDOORS) & (rooms_of(starts, rooms) != number)
+    return np.where(blocked | elsewhere | (beyond == number), -1, beyond)
+
+
+def _face_openings(rays: RayScene, number: int, rooms: tuple[Room, ...]) -> list[Opening]:
+    room = rooms[number - 1]
     low, high = np.array(room.minimum), np.array(room.maximum)
     count = np.maximum(np.round((high - low) / ROOM_CELL_M), 1).astype(np.int64)
     found = []
@@ -43,35 +74,34 @@ def _face_openings(rays: RayScene, room: Room, rooms: tuple[Room, ...]) -> list[
         face = np.zeros((len(at), 3))
         face[:, across] = low[across] + (at + 0.5) * ((high - low) / count)[across]
         for sign, plane in ((-1.0, low[axis]), (1.0, high[axis])):
-            inward = min(INSIDE_M, (high[axis] - low[axis]) / 2)
             face[:, axis] = plane
             way = np.zeros(3)
             way[axis] = sign
-            blocked = rays.occluded(face - inward * way, np.tile(way, (len(face), 1)), np.full(len(face), inward + OUTSIDE_M))
-            is_open = ~blocked & (rooms_of(face + OUTSIDE_M * way, rooms) == ROOM_OUTDOORS)
-            parts, _ = label(is_open.reshape(count[across]), np.ones((3, 3)))
-            for part in find_objects(parts):
-                first, last = low.copy(), high.copy()
-                first[axis] = last[axis] = plane
-                size = ((high - low) / count)[across]
-                first[across] = low[across] + [part[0].start, part[1].start] * size
-                last[across] = low[across] + [part[0].stop, part[1].stop] * size
-                found.append(_to_rim(rays, (first, last), (low, high), axis, sign))
+            beyond = _beyond(rays, number, rooms, (face, min(INSIDE_M, (high[axis] - low[axis]) / 2)), way)
+            for to in np.unique(beyond[beyond >= 0]).tolist():
+                parts, _ = label((beyond == to).reshape(count[across]), np.ones((3, 3)))
+                for part in find_objects(parts):
+                    first, last = low.copy(), high.copy()
+                    first[axis] = last[axis] = plane
+                    size = ((high - low) / count)[across]
+                    first[across] = low[across] + [part[0].start, part[1].start] * size
+                    last[across] = low[across] + [part[0].stop, part[1].stop] * size
+                    found.append(replace(_to_rim(rays, (first, last), (low, high), axis, sign), to=to))
     return found
 
 
-def _mesh_openings(rays: RayScene, room: Room, rooms: tuple[Room, ...]) -> tuple[Opening, ...]:
+def _cell_openings(rays: RayScene, number: int, rooms: tuple[Room, ...]) -> list[Opening]:
     """Openings of a room in cells, looked for as those of a box: from a little inside each face of its air to a little outside."""
+    room = rooms[number - 1]
     assert room.cells is not None
     cell_m, margin = room.cells.size_m, _FACING_CELLS // 2 + 1
     air = np.pad(air_of(room.cells), margin)
     first = np.array(room.cells.first) - margin
     low, high = np.array(room.minimum), np.array(room.maximum)
     density = uniform_filter(air.astype(np.float32), _FACING_CELLS)
-    cuts = []
+    links: list[tuple[int, Int64, Int64]] = []
     for axis in range(3):
         own, along = np.moveaxis(air, axis, 0), (1, 2, 0)[axis]
-        cut = np.ones((len(own) - 1, *own.shape[1:]), np.bool_)
         for here, there, sign in ((slice(1, None), slice(None, -1), -1.0), (slice(None, -1), slice(1, None), 1.0)):
             face = np.moveaxis(np.zeros_like(air), axis, 0)
             face[here] = own[here] & ~own[there]
@@ -82,12 +112,31 @@ def _mesh_openings(rays: RayScene, room: Room, rooms: tuple[Room, ...]) -> tuple
             middle[:, along] = np.clip(middle[:, along] + sign * cell_m / 2, low[along], high[along])
             way = np.zeros(3)
             way[along] = sign
-            blocked = rays.occluded(middle - INSIDE_M * way, np.tile(way, (len(at), 1)), np.full(len(at), INSIDE_M + OUTSIDE_M))
-            is_open = ~blocked & (rooms_of(middle + OUTSIDE_M * way, rooms) == ROOM_OUTDOORS)
-            link = np.moveaxis(at[is_open], 1, 0)[[axis, *(other for other in range(3) if other != axis)]]
-            cut[link[0] - (sign < 0), link[1], link[2]] = False
-        cuts.append(np.moveaxis(cut, 0, axis))
-    return opening_boxes(rays, np.where(air, np.int32(1), np.int32(2)), 1, {1}, tuple(cuts), first, low, high, cell_m)
+            # A link is as its lower cell.
+            links.append((axis, at - (sign < 0) * np.eye(3, dtype=np.int64)[axis], _beyond(rays, number, rooms, (middle, INSIDE_M), way)))
+    found = []
+    for to in sorted({to for _, _, beyond in links for to in np.unique(beyond).tolist()} - {-1}):
+        cuts = [np.ones(np.array(air.shape) - np.eye(3, dtype=np.int64)[axis], np.bool_) for axis in range(3)]
+        for axis, link, beyond in links:
+            cuts[axis][tuple(link[beyond == to].T)] = False
+        boxes = opening_boxes(rays, np.where(air, np.int32(1), np.int32(2)), 1, {1}, tuple(cuts), first, low, high, cell_m)
+        found += [replace(box, to=to) for box in boxes]
+    return found
+
+
+def _through(door: Opening, rooms: tuple[Room, ...]) -> Opening:
+    """A door that was found on one room's side of a wall, through the wall to where the other room begins."""
+    low, high = np.array(door.minimum), np.array(door.maximum)
+    axis = int(np.argmin(high - low))
+    middle = (low + high) / 2
+    middle[1] = high[1] - (high[1] - low[1]) / 4  # above the floor, of a door that goes on below it
+    for way in np.arange(0.0, OUTSIDE_M, THROUGH_STEP_M):
+        for ends, sign in ((low, -1.0), (high, 1.0)):
+            middle[axis] = ends[axis] + sign * way
+            if rooms_of(middle[None], rooms)[0] == door.to:
+                ends[axis] = round(middle[axis], 4)
+                return Opening(point(low), point(high), door.to)
+    return door
 
 
 def _to_rim(rays: RayScene, ends: tuple[Float64, Float64], room: tuple[Float64, Float64], axis: int, outward: float) -> Opening:

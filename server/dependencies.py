@@ -86,6 +86,11 @@ class VolumeQuery(PositionQuery, VolumeFormatQuery):
     weight: bool = Field(
         False, description="of kind=interior, 1: where its rooms are and how near their openings, instead of light: uint8, npy or raw"
     )
+    to: str | None = Field(
+        None,
+        max_length=200,
+        description="of weight, a name or number: how near the room's doors to that one are, instead of its other openings",
+    )
     basis: Literal["cube", "sh1", "sh2"] = Field(
         "cube", description="cube: +X -X +Y -Y +Z -Z; harmonics: 4 or 9 coefficients, where `/v1/world` says that they can be had"
     )
@@ -99,6 +104,8 @@ class VolumeQuery(PositionQuery, VolumeFormatQuery):
             raise ValueError("room with kind=interior only")
         if self.weight and (self.kind != "interior" or self.mask or self.format == "ktx2"):
             raise ValueError("weight with kind=interior, format=npy or raw, and no mask")
+        if self.to is not None and (not self.weight or self.room is None):
+            raise ValueError("to with weight=1 and room only")
         if self.kind == "interior" and self.cascade != 0:
             raise ValueError("cascade=0 of kind=interior")
         if self.kind == "fog" and self.basis != "cube":

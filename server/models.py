@@ -104,6 +104,10 @@ class OpeningReply(BaseModel):
     maximum: Vector3
 
 
+class DoorReply(OpeningReply):
+    to: int = Field(description="number of the other room")
+
+
 class RoomReply(BaseModel):
     number: int = Field(description="from 1; probes and interior volumes name rooms so")
     name: str
@@ -114,6 +118,7 @@ class RoomReply(BaseModel):
     openings: list[OpeningReply] = Field(
         description="boxes, most of them flat, in which its air meets the open air: windows, and doors, which go on below the floor"
     )
+    doors: list[DoorReply] = Field(description="the same between it and other rooms, from its side of the wall to theirs; each is in both")
 
 
 class WorldReply(BaseModel):

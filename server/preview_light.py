@@ -1,6 +1,6 @@
 """Served light as a picture reads it: volumes, and beyond them the texture of distant sectors (slide "Distant shading").
 
-    in a room              its interior volume; at its openings, on both sides, a mix with the outdoor one (gi_core.rooms.indoor_shares)
+    in a room              its interior volume; at its openings, on both sides, a mix with what is beyond (gi_core.rooms.light_shares)
     in a volume's box      the volume
     up to FADE_M beyond    its edge, faded into the texture
     farther                the texture alone
@@ -22,7 +22,7 @@ from gi_core.distant_file import DistantLight
 from gi_core.engine import Distant, Engine
 from gi_core.errors import InputError
 from gi_core.lighting import Lighting
-from gi_core.rooms import indoor_shares
+from gi_core.rooms import light_shares
 from gi_core.settings import Settings
 from gi_core.volume import Volume, sample_coefficients, sample_volume
 from gi_core.world import Decal, Room
@@ -124,12 +124,10 @@ class ServedLight:
     def _parts(self, points: Float64, surface: Float64, most: int) -> Iterator[tuple[Volume, Int64, Float32, bool]]:
         """Volumes, at most ``most`` of each room and of the open air, the points (k,) that each lights, its share of their light (k,), and
         whether it is a room's. The shares of a point sum to 1."""
-        room, indoors = indoor_shares(points, self.rooms, surface)
-        for number in np.unique(np.append(room[indoors > 0], ROOM_OUTDOORS)).tolist():
-            share = np.where(room == number, indoors, 0) if number else 1 - indoors
+        shares = light_shares(points, self.rooms, surface)
+        for number in np.unique(shares.room).tolist():
+            share = shares.of(number, len(points))
             there = np.flatnonzero(share > 0)
-            if not len(there):
-                continue
             if self.player is None:
                 centres, which = plan_volumes(points[there], most)
             else:

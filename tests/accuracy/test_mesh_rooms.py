@@ -17,7 +17,7 @@ from gi_core.constants import VOXEL_INDOORS
 from gi_core.dataset import Dataset
 from gi_core.engine import Engine
 from gi_core.grid import SectorIndex
-from gi_core.rooms import indoor_shares, rooms_of
+from gi_core.rooms import light_shares, rooms_of
 from gi_core.volume import sample_volume
 from gi_core.world import Lamp, Location
 
@@ -82,8 +82,7 @@ def seen(engine: Engine, lighting, room: int, where: tuple[np.ndarray, np.ndarra
     points, normals = where[0], where[1].astype(np.float32)
     outdoor = engine.volume(np.array([32.0, 3.0, 32.0]), lighting)
     indoor = engine.interior(np.array([32.0, 3.0, 32.0]), lighting, room=str(room))
-    number, share = indoor_shares(points + indoor.voxel_size / 4 * normals, engine.dataset.world.rooms, points)
-    share = np.where(number == room, share, 0)
+    share = light_shares(points + indoor.voxel_size / 4 * normals, engine.dataset.world.rooms, points).of(room, len(points))
     light = [sample_volume(v.values, v.origin, v.voxel_size, points, normals)[:, 1] for v in (outdoor, indoor)]
     return light[0] + share * (light[1] - light[0])
 
