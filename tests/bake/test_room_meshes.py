@@ -1,5 +1,7 @@
 """Rooms drawn as meshes: their air is what the mesh encloses, whatever way it was drawn, and what encloses nothing is refused by name."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -175,6 +177,13 @@ def test_a_mesh_has_openings_where_its_walls_have_and_nowhere_else(build):
     x, z = (6, slice(8.05, 9.55))
     np.testing.assert_allclose((window.minimum[1:], window.maximum[1:]), ((0.9, z.start), (2.2, z.stop)), atol=2e-3)
     assert window.minimum[0] == window.maximum[0] == pytest.approx(x, abs=ROOM_CELL_M / 2 + 1e-6)
+    # A room beyond the window, drawn as a box: the same window, through the rest of the wall, leads to it.
+    hall_again, yard = world_rooms(block.scene(rooms=(hall, Room("yard", (6.1, 0, 6.1), (11, 3, 11)))), "none")
+    inner = [opening for opening in hall_again.openings if opening.to == 2]
+    assert inner == [replace(window, minimum=inner[0].minimum, maximum=inner[0].maximum, to=2)]
+    np.testing.assert_allclose(inner[0].minimum, window.minimum, atol=2e-3)
+    np.testing.assert_allclose(inner[0].maximum, (6.1, 2.2, 9.55), atol=0.011)
+    assert replace(inner[0], to=1) in yard.openings
     (closed,) = world_rooms(l_house(build, with_holes=False).scene(rooms=(hall,)), "none")
     assert closed.openings == ()
 
