@@ -98,7 +98,8 @@ def rooms_of(position: Float64, rooms: tuple[Room, ...], slack_m: float = 0.0) -
     """Number of the first room that holds each world position (n, 3) [m], or whose box is that near, counting from 1; 0 outdoors."""
     found = np.full(len(position), ROOM_OUTDOORS, np.uint16)
     for number in _reached(position, rooms, slack_m)[::-1]:
-        found[holds(rooms[number - 1], position, slack_m)] = number
+        near = _near(rooms[number - 1], position, slack_m)
+        found[near[holds(rooms[number - 1], position[near], slack_m)]] = number
     return found
 
 
@@ -163,11 +164,12 @@ def light_shares(position: Float64, rooms: tuple[Room, ...], surface: Float64 | 
         own[between] = _IN_DOORWAY
         parts += [(between, beyond, np.full(len(between), 0.5, np.float32)) for beyond in (number, door.to)]
     for number in reached:
-        for other in sorted({opening.to for opening in rooms[number - 1].openings}):
+        room = rooms[number - 1]
+        near = _near(room, surface, OPENING_DEPTH_M + _reach(room))
+        for other in sorted({opening.to for opening in room.openings}):
             # Doors between rooms are among those of both.
-            of_both = (own == ROOM_OUTDOORS) if other == ROOM_OUTDOORS else np.zeros(len(own), np.bool_)
-            here = np.flatnonzero((own == number) | of_both)
-            half = opening_nearness(rooms[number - 1], surface[here], other) / 2
+            here = near[(own[near] == number) | ((own[near] == ROOM_OUTDOORS) & (other == ROOM_OUTDOORS))]
+            half = opening_nearness(room, surface[here], other) / 2
             for inside, lends in ((number, other), (other, number)):
                 seen = (half > 0) & (own[here] == inside)
                 parts.append((here[seen], lends, half[seen]))
@@ -176,9 +178,18 @@ def light_shares(position: Float64, rooms: tuple[Room, ...], surface: Float64 | 
         np.add.at(lent, at, share)
     rest = np.flatnonzero((lent < 1) & (own != _IN_DOORWAY))
     point = np.concatenate([at for at, _, _ in parts] + [rest])
-    room = np.concatenate([np.full(len(at), lends) for at, lends, _ in parts] + [own[rest]])
+    lender = np.concatenate([np.full(len(at), lends) for at, lends, _ in parts] + [own[rest]])
     share = np.concatenate([share / np.maximum(lent[at], 1) for at, _, share in parts] + [1 - lent[rest]])
-    return Shares(point, room.astype(np.uint16), share.astype(np.float32))
+    return Shares(point, lender.astype(np.uint16), share.astype(np.float32))
+
+
+def _near(room: Room, position: Float64, reach_m: float) -> Int64:
+    """Which positions (n, 3) [m] lie within a way of a room's box, along each axis."""
+    near = np.arange(len(position))
+    for axis in range(3):  # one after another: most are far along the first
+        along = position[near, axis]
+        near = near[(along >= room.minimum[axis] - reach_m) & (along <= room.maximum[axis] + reach_m)]
+    return near
 
 
 def _in_box(opening: Opening, position: Float64) -> Bool:
