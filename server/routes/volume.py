@@ -49,7 +49,8 @@ def volume(request: Request, service: ServiceDep, query: Annotated[VolumeQuery, 
 
     `kind=outdoor`: no light of rooms; a voxel in one holds what the nearest one outdoors has. `kind=interior`: of a room alone; every other
     voxel holds what the nearest inside has, and `rooms` in the header places its box: inside it sample this volume, else the outdoor
-    one. `kind=fog`: outdoor light averaged over directions, (16, 32, 32, 3).
+    one; a room whose `shape` in `/v1/world` is `cells` is of that only where plane 0 of `weight=1` is 255. `kind=fog`: outdoor light
+    averaged over directions, (16, 32, 32, 3).
     `kind=interior&weight=1`: what makes a step through a door smooth, in cells of a quarter voxel, uint8 (2, 64, 128, 128). Plane 0, read
     at the nearest cell, is 255 in the rooms and 0 outside; plane 1, read linearly, n = 0..1 as 0..255, tells how much an opening fills the
     view. The share of the interior volume is 1 - n / 2 inside and n / 2 outside: sharp at walls, continuous through openings. Read plane 0
