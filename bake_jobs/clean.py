@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import shapely
+from scipy.ndimage import distance_transform_edt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -11,6 +12,7 @@ from bake_jobs.scene import DroppedTriangles, Mesh
 from gi_core.arrays import Bool, Float32, Float64, Int64
 from gi_core.constants import ALBEDO_MAX
 from gi_core.errors import SourceError
+from gi_core.rooms import air_of
 from gi_core.world import Room
 
 MAX_TRIANGLES = 50_000_000  # about 5 GB of scene; a city is a few million
@@ -19,6 +21,8 @@ MAX_EXTENT_M = 1e6  # wider than this is a wrong unit or a stray vertex, not a c
 DEGENERATE_RATIO = 1e-10
 # Nested shells are looked for around this many inside-out ones at a time, to bound memory.
 NESTING_CHUNK = 4096
+# So many of a room's cells suffice to find a place deep inside it.
+DEEP_CELLS = 1 << 18
 
 
 def clean_mesh(mesh: Mesh, where: str, rooms: tuple[Room, ...] = ()) -> tuple[Mesh, DroppedTriangles]:
@@ -128,9 +132,20 @@ def _inside_out(vertices: Float64, triangles: Int64, rooms: tuple[Room, ...]) ->
         flip[outer[nested]] = False
         flip[inner[nested & closed[outer]]] = False
     for room in rooms:
-        middle = (np.array(room.minimum) + np.array(room.maximum)) / 2
+        middle = _deep_in(room)
         flip[np.all((low < middle) & (high > middle), axis=1)] = False
     return np.asarray(flip[component], np.bool_)
+
+
+def _deep_in(room: Room) -> Float64:
+    """(3,) [m]: a place well inside a room, the middle of its box or of the cell that is farthest from what is not its air."""
+    if room.cells is None:
+        return np.asarray((np.array(room.minimum) + np.array(room.maximum)) / 2)
+    air = air_of(room.cells)
+    coarse = max(round((air.size / DEEP_CELLS) ** (1 / 3)), 1)
+    depth = distance_transform_edt(np.pad(air[::coarse, ::coarse, ::coarse], 1))
+    y, z, x = coarse * (np.array(np.unravel_index(np.argmax(depth), depth.shape)) - 1)
+    return np.asarray((np.array([x, y, z]) + room.cells.first + 0.5) * room.cells.size_m)
 
 
 def _touching_pairs(tree: shapely.STRtree, low: Float64, high: Float64, candidates: Int64) -> Iterator[tuple[Int64, Int64]]:

@@ -2,8 +2,8 @@
 
 python -m bake_jobs.door_study DATASET SOURCE X,Y,Z X,Y,Z [STATE...]     a table on stdout, of a way from one place to the other
 
-Light is the mean of irradiance over all directions, as it falls on somebody who walks there. A client may sample the outdoor volume alone;
-switch sharply to the interior one where the room begins; or mix the two by ``indoor_shares``.
+Light is the mean of irradiance over all directions, as it falls on somebody who walks there. A client may sample one volume alone, the
+outdoor one or a room's; switch sharply from one to the next where that one's room begins; or mix them by ``light_shares``.
 """
 
 import sys
@@ -23,7 +23,7 @@ from gi_core.engine import Engine
 from gi_core.errors import InputError
 from gi_core.lighting import Lighting
 from gi_core.lights import lamps_on
-from gi_core.rooms import indoor_shares, rooms_of
+from gi_core.rooms import light_shares, rooms_of
 from gi_core.spectrum import LUMINANCE_FROM_RGB
 from gi_core.volume import Volume, sample_coefficients
 
@@ -36,10 +36,10 @@ DARKEST = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Walk:
-    """Light [lx] at places (n, 3) [m], STEP_M apart: each way of sampling it (n,)."""
+    """Light [lx] at places (n, 3) [m], STEP_M apart: (n,) of each volume that has a part in it, by its room (0: outdoors), and mixed."""
 
     place: Float64
-    outdoor: Float64
+    volumes: dict[int, Float64]
     hard: Float64
     blended: Float64
 
@@ -63,29 +63,39 @@ def print_table(engine: Engine, source: str, start: Float64, end: Float64, state
         walk = walk_through(engine, start, end, lighting)
         estimate = tracer.cube_irradiance(walk.place, lighting, lamps_on(engine.lamps, lighting), samples=SAMPLES)
         truth = _mean_light(estimate.mean.astype(np.float32))
-        for name, light in (("outdoor volume", walk.outdoor), ("hard", walk.hard), ("blended", walk.blended), ("path tracer", truth)):
+        names = {number: f"volume of {room.name}" for number, room in enumerate(engine.dataset.world.rooms, 1)}
+        volumes = [(names.get(number, "outdoor volume"), light) for number, light in walk.volumes.items()]
+        for name, light in (*volumes, ("hard", walk.hard), ("blended", walk.blended), ("path tracer", truth)):
             error = np.mean(np.abs(light - truth) / np.maximum(truth, DARKEST * truth.mean()))
             step = largest_step(light)
             print(f"| {state.name} | {name} | {step:.3g} | {100 * step / np.ptp(truth):.1f} | {100 * error:.0f} |")
 
 
 def walk_through(engine: Engine, start: Float64, end: Float64, lighting: Lighting) -> Walk:
-    """Light on the straight way between two places (3,) [m] that passes into or out of one room.
+    """Light on the straight way between two places (3,) [m] that passes into or out of a room.
 
     Raises InputError for a way that touches no room, and what ``Engine.interior`` raises.
     """
     length = float(np.linalg.norm(end - start))
     place = start + np.arange(0, length, STEP_M)[:, None] * (end - start) / length
     rooms = engine.dataset.world.rooms
-    room, share = indoor_shares(place, rooms)
-    touched = np.unique(room[room != ROOM_OUTDOORS])
-    if len(touched) != 1:
-        raise InputError(f"expected a way into one room, found {len(touched)}")
+    shares, own = light_shares(place, rooms), rooms_of(place, rooms)
+    touched = np.unique(shares.room).tolist()
+    if touched == [ROOM_OUTDOORS]:
+        raise InputError("expected a way into a room, found one that touches none")
     middle = (start + end) / 2
-    outdoor = _sampled(engine.volume(middle, lighting, basis="cube"), place)
-    indoor = _sampled(engine.interior(middle, lighting, basis="cube", room=str(touched[0])), place)
-    hard = np.where(rooms_of(place, rooms) != ROOM_OUTDOORS, indoor, outdoor)
-    return Walk(place, outdoor, hard, (1 - share) * outdoor + share * indoor)
+    volumes = {
+        number: _sampled(
+            engine.interior(middle, lighting, basis="cube", room=str(number)) if number else engine.volume(middle, lighting, basis="cube"),
+            place,
+        )
+        for number in touched
+    }
+    blended = sum((shares.of(number, len(place)) * light for number, light in volumes.items()), start=np.zeros(len(place)))
+    if ROOM_OUTDOORS not in touched:  # a switch in the middle of the wall, where no room is
+        inside = np.flatnonzero(own != ROOM_OUTDOORS)
+        own = own[inside[np.abs(np.arange(len(place))[:, None] - inside).argmin(axis=1)]]
+    return Walk(place, volumes, np.choose(np.searchsorted(touched, own), list(volumes.values())), blended)
 
 
 def largest_step(light: Float64) -> float:

@@ -17,7 +17,7 @@ from bake_jobs.air_basins import contacts, find_basins
 from bake_jobs.covered_air import COLUMN_CELLS, MAX_CEILING_M, AirColumns, CoveredRegion, covered_regions
 from bake_jobs.ray_lines import cut_lattice
 from bake_jobs.rays import RayScene
-from bake_jobs.room_openings import SEAM_M, authored_openings, opening_boxes, point, walls_around
+from bake_jobs.room_openings import SEAM_M, opening_boxes, point, walls_around, with_openings
 from bake_jobs.scene import Scene, Search
 from gi_core.arrays import Bool, Float64, Int32, Int64
 from gi_core.constants import ROOM_CELL_M
@@ -63,15 +63,13 @@ def world_rooms(scene: Scene, search: Search) -> tuple[Room, ...]:
     if not scene.rooms and search == "none":
         return ()
     rays = RayScene(scene.vertices, scene.triangles)
-    authored = authored_openings(rays, scene.rooms)
     if search == "none":
-        return authored
+        return with_openings(rays, scene.rooms)
     columns = AirColumns(scene, rays)
-    found = [room for region in covered_regions(columns) for room in rooms_in(region, columns, authored, search == "all")]
+    found = [room for region in covered_regions(columns) for room in rooms_in(region, columns, scene.rooms, search == "all")]
     found.sort(key=lambda room: (room.minimum[2], room.minimum[0], room.minimum[1]))
-    return authored + tuple(
-        Room(f"found-{number}", room.minimum, room.maximum, room.openings, room.cells) for number, room in enumerate(found, 1)
-    )
+    named = (Room(f"found-{number}", room.minimum, room.maximum, room.openings, room.cells) for number, room in enumerate(found, 1))
+    return with_openings(rays, (*scene.rooms, *named))
 
 
 def rooms_in(region: CoveredRegion, columns: AirColumns, authored: tuple[Room, ...], closed_too: bool) -> list[Room]:
@@ -95,14 +93,14 @@ def rooms_in(region: CoveredRegion, columns: AirColumns, authored: tuple[Room, .
             low, high = walls_around(columns.rays, centre, ROOM_CELL_M)
             near, corner, cuts = cells.around(place)
             openings = opening_boxes(columns.rays, basin[near], number, chosen, cuts, corner, low, high)
-            air = _to_box(basin[near], number, chosen, cuts, corner, low, high)
+            air = _to_box(basin[near], number, cuts, corner, low, high)
             rooms.append(Room("", point(low), point(high), openings, pack_cells(air)))
     return rooms
 
 
-def _to_box(basin: Int32, number: int, rooms: set[int], cuts: tuple[Bool, ...], first: Int64, low: Float64, high: Float64) -> Int64:
+def _to_box(basin: Int32, number: int, cuts: tuple[Bool, ...], first: Int64, low: Float64, high: Float64) -> Int64:
     """Lattice indices (n, 3), x, y, z, of a room's cells, to the sides of its box and no farther: a seam may leave a doorway to the
-    room, or some of the floor before it to the outdoors.
+    room, or some of the floor before it to what lies beyond, the outdoors or another room.
 
     basin : (ny, nz, nx) with ``cuts`` between cells; first : lattice index of cell (0, 0, 0); low, high : (3,) [m]
     """
@@ -110,7 +108,7 @@ def _to_box(basin: Int32, number: int, rooms: set[int], cuts: tuple[Bool, ...], 
     at = np.stack([x, y, z], axis=-1) + first
     centre = (at + 0.5) * ROOM_CELL_M
     beside = ((centre - low < SEAM_M) | (high - centre < SEAM_M))[..., [0, 2]].any(axis=-1)
-    lost = (basin > 0) & ~np.isin(basin, list(rooms)) & beside
+    lost = (basin > 0) & (basin != number) & beside
     air = basin == number
     for _ in range(round(SEAM_M / ROOM_CELL_M)):
         air = air | (lost & (_next_to(air.astype(np.int32), cuts) == 1))

@@ -86,7 +86,7 @@ def rooms_of_hits(gbuffer: GBuffer, probe_room: UInt16, rooms: tuple[Room, ...])
     present = np.unique(probe_room[probe_room != ROOM_OUTDOORS])
     for slack, of_own_probes in ((ROOM_SLACK_M, True), (0.0, False)):
         for number in present[::-1]:
-            inside = holds(rooms[number - 1], air, slack)
+            inside = holds(rooms[number - 1], air, slack, grown=slack > 0)
             room[inside & (seen_from == number) if of_own_probes else inside] = number
     room[~gbuffer.hits.hit] = ROOM_OUTDOORS
     return room

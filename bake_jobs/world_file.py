@@ -24,6 +24,11 @@ name = "lobby"
 minimum = [0.0, 0.0, 0.0]
 maximum = [8.0, 4.0, 6.0]
 
+[[room]]                               # or the inside of a closed mesh, kept in cells of 0.1 m
+name = "hall"
+mesh = "hall.obj"                      # .glb .gltf .obj or .ply, relative to this file
+offset = [0.0, 0.0, 0.0]               # as of a source
+
 [[lamp]]
 name = "corner"
 kind = "point"                         # point, spot or area (a rectangle that shines to one side)
@@ -59,6 +64,8 @@ import numpy as np
 
 from bake_jobs.geography import MapFrame, timezone_at
 from bake_jobs.lamp_file import read_lamp
+from bake_jobs.mesh_source import MESH_SUFFIXES
+from bake_jobs.room_meshes import mesh_room
 from bake_jobs.scene import Mesh, ProbeHint, Search, SourceContent, join_meshes
 from bake_jobs.table import Table, read_toml
 from gi_core.dataset import MAX_DECALS
@@ -80,7 +87,7 @@ def load_world_file(path: Path, load: Loader) -> SourceContent:
     location = _location(given, north) if given else None
     frame = MapFrame(location.latitude_degrees, location.longitude_degrees, north) if location else None
     sources = [_source(table, path.parent, frame, north, load) for table in top.tables("source")]
-    rooms = tuple(_room(table) for table in top.tables("room"))
+    rooms = tuple(_room(table, path.parent, load) for table in top.tables("room"))
     search = _search(top.table("rooms"))
     lamps = tuple(read_lamp(table) for table in top.tables("lamp"))
     hints = tuple(_hint(table) for table in top.tables("hint"))
@@ -132,11 +139,23 @@ def _source(table: Table, folder: Path, frame: MapFrame | None, north: float, lo
     return dataclasses.replace(content, mesh=Mesh(mesh.vertices + np.array(offset), mesh.triangles, colour, mesh.emission))
 
 
-def _room(table: Table) -> Room:
+def _room(table: Table, folder: Path, load: Loader) -> Room:
     name = table.text("name", None)
-    minimum, maximum = _box(table)
+    if "mesh" not in table:
+        minimum, maximum = _box(table)
+        table.refuse_unknown()
+        return Room(name, minimum, maximum)
+    path = folder / table.text("mesh", None)
+    offset = table.vector("offset", (0.0, 0.0, 0.0))
+    if "minimum" in table or "maximum" in table:
+        raise SourceError(f"{table.where}: expected a mesh, or minimum and maximum, found both")
     table.refuse_unknown()
-    return Room(name, minimum, maximum)
+    if not path.name.lower().endswith(MESH_SUFFIXES):
+        raise SourceError(f"{table.where}: mesh: expected {' '.join(MESH_SUFFIXES)}, found {path}")
+    if not path.is_file():
+        raise SourceError(f"{table.where}: mesh: expected a file, found none at {path}")
+    drawn = load(path, None).mesh
+    return mesh_room(name, dataclasses.replace(drawn, vertices=drawn.vertices + np.array(offset)), f"{table.where}: {path}")
 
 
 def _search(table: Table | None) -> Search:

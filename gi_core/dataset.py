@@ -1,11 +1,9 @@
 """A baked city on disk: ``world.json``, ``sectors/*.gisec``, ``geometry/*.gigeo``, ``distant.gidist``, and ``fine/*.givox`` where
 fine voxels were asked for. The only thing that bakes and servers share. FORMAT.md describes it."""
 
-import base64
 import hashlib
 import json
 import re
-import zlib
 from dataclasses import asdict, dataclass
 from datetime import date
 from pathlib import Path
@@ -24,16 +22,17 @@ from gi_core.geometry_file import Geometry
 from gi_core.grid import SectorIndex
 from gi_core.json_fields import Fields, all_finite
 from gi_core.lights import MAX_LUMENS, check_lamp
+from gi_core.room_records import DOORS_VERSION, ROOMS_VERSION, needs_doors_version, read_rooms, room_json
 from gi_core.sector import Sector
 from gi_core.sky_patches import MIN_PATCHES, SKY_SCHEMES
 from gi_core.sun_table import SunTable
 from gi_core.voxel_grid import VoxelGrid
-from gi_core.world import LAMP_KINDS, Decal, Lamp, Location, Opening, Room, RoomCells
+from gi_core.world import LAMP_KINDS, Decal, Lamp, Location, Room
 
 FORMAT = "sectorlight-dataset"
 # Version 1 knew the ambient cube under six sky scalars alone; a bake of that kind still has it, so that older programs read it.
-# Version 3 has fine voxels, version 4 decals, version 5 rooms with openings, or found by the bake.
-VERSION, DECALS_VERSION, FINE_VERSION, PATCHES_VERSION, CUBE_VERSION = 5, 4, 3, 2, 1
+# Version 3 has fine voxels, version 4 decals, versions 5 and 6 rooms (gi_core.room_records).
+VERSION, DECALS_VERSION, FINE_VERSION, PATCHES_VERSION, CUBE_VERSION = DOORS_VERSION, 4, 3, 2, 1
 WORLD_FILE = "world.json"
 DISTANT_FILE = "distant.gidist"
 MAX_WORLD_BYTES = 1 << 28
@@ -41,10 +40,6 @@ MAX_WORLD_BYTES = 1 << 28
 MAX_SECTORS = 1 << 24
 # 64 000 km from the origin.
 MAX_SECTOR_COORDINATE = 1_000_000
-# Room numbers have 16 bits, and 0 is outdoors.
-MAX_ROOMS = 65_535
-MAX_OPENINGS = 4096  # of one room
-MAX_ROOM_CELLS = 1 << 26  # of the box of one room: 160 m each way
 MAX_LAMPS = 1 << 20
 # Six times the talk's 22 300 vehicles.
 MAX_DECALS = 1 << 17
@@ -132,8 +127,10 @@ class WorldInfo:
     @property
     def version(self) -> int:
         """The lowest format version of world.json that can say this."""
-        if any(room.openings or room.is_found for room in self.rooms):
+        if any(needs_doors_version(room) for room in self.rooms):
             return VERSION
+        if any(room.openings or room.cells is not None for room in self.rooms):
+            return ROOMS_VERSION
         if self.decals:
             return DECALS_VERSION
         if self.has_fine_voxels:
@@ -160,7 +157,7 @@ class WorldInfo:
             "seed": self.seed,
             "sun_table": self.sun_table.to_json(),
             "sectors": {f"{i.x},{i.z}": self.sectors[i].to_json() for i in sorted(self.sectors)},
-            "rooms": [_room_json(room) if self.version == VERSION else room.box_json() for room in self.rooms],
+            "rooms": [room_json(room, self.version) for room in self.rooms],
             "lamps": [asdict(lamp) for lamp in self.lamps],
             "dropped_triangles": self.dropped_triangles,
             "error_report": self.error_report,
@@ -205,7 +202,7 @@ class WorldInfo:
             seed=top.integer("seed"),
             sun_table=_sun_table(record["sun_table"], where),
             sectors=_sectors(top, found),
-            rooms=tuple(_room(record, f"{where}: rooms", found) for record in top.sequence("rooms", MAX_ROOMS)),
+            rooms=read_rooms(top, found),
             lamps=tuple(_lamp(Fields(r, f"{where}: lamps", Lamp.__dataclass_fields__)) for r in top.sequence("lamps", MAX_LAMPS)),
             dropped_triangles={name: top.fields("dropped_triangles").integer(name) for name in top.mapping("dropped_triangles")},
             error_report=report,
@@ -278,40 +275,6 @@ def _location(place: Fields) -> Location:
         date=day,
         source=place.text("source"),
     )
-
-
-def _room_json(room: Room) -> dict[str, Any]:
-    cells = None
-    if room.cells is not None:
-        bits = base64.b64encode(zlib.compress(room.cells.bits, 9)).decode()
-        cells = {"first": room.cells.first, "shape": room.cells.shape, "bits": bits}
-    return room.box_json() | {"openings": [asdict(opening) for opening in room.openings], "cells": cells}
-
-
-def _room(record: Any, where: str, version: int) -> Room:
-    room = Fields(record, where, Room.__dataclass_fields__ if version == VERSION else ("name", "minimum", "maximum"))
-    box = room.text("name"), room.point("minimum"), room.point("maximum")
-    if version < VERSION:
-        return Room(*box)
-    openings = (Fields(record, f"{room.where}: openings", ("minimum", "maximum")) for record in room.sequence("openings", MAX_OPENINGS))
-    cells = _room_cells(room.fields("cells", ("first", "shape", "bits"))) if room.has("cells") else None
-    return Room(*box, tuple(Opening(opening.point("minimum"), opening.point("maximum")) for opening in openings), cells)
-
-
-def _room_cells(cells: Fields) -> RoomCells:
-    (x, y, z), (nx, ny, nz) = cells.triple("first", -(1 << 31), (1 << 31) - 1), cells.triple("shape", 1, MAX_ROOM_CELLS)
-    size = (nx * ny * nz + 7) // 8
-    if size > MAX_ROOM_CELLS // 8:
-        raise CorruptFileError(f"{cells.where}: shape: expected at most {MAX_ROOM_CELLS} cells, found {nx * ny * nz}; bake it again")
-    try:
-        unpacker = zlib.decompressobj()
-        # A byte more than there may be tells that there are too many, without making room for them.
-        bits = unpacker.decompress(base64.b64decode(cells.text("bits", MAX_ROOM_CELLS // 4), validate=True), size + 1)
-    except (ValueError, zlib.error) as error:
-        raise CorruptFileError(f"{cells.where}: bits: expected zlib in base64 ({error}); bake it again") from error
-    if len(bits) != size or not unpacker.eof:
-        raise CorruptFileError(f"{cells.where}: bits: expected {size} bytes for {nx * ny * nz} cells, found another number; bake it again")
-    return RoomCells((x, y, z), (nx, ny, nz), bits)
 
 
 def _lamp(lamp: Fields) -> Lamp:

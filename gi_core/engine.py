@@ -305,7 +305,7 @@ class Engine:
         texels = self.dataset.distant()
         transfer = texels.transfer
         if light == "full" and transfer is None:
-            raise InputError("light=full: this dataset's distant texture knows the sky alone; expected sky, or bake it again")
+            raise InputError("light full: this dataset's distant texture knows the sky alone; expected sky, or bake it again")
         if light == "sky" or transfer is None:
             values = texels.sky[..., None] * face_exitance(lighting)
             return Distant(values.astype(np.float32), texels.origin, texels.valid)

@@ -6,6 +6,7 @@ its room, what the nearest inside has: coordinates clamped to the room, worked o
 """
 
 import re
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -18,6 +19,9 @@ from gi_core.world import Opening, Room, RoomCells
 
 # Cells of a weight lattice along a voxel: as long as the way off a surface at which clients sample light.
 WEIGHT_CELLS = 4
+# Rays that meet a wall where another one ends may do so this far behind the other: pixels there had the street's light.
+EDGE_M = 0.003
+_IN_DOORWAY = -1  # in no room, and not outdoors
 _FAR = np.int32(1 << 12)  # voxels; no two are as far apart
 
 
@@ -90,55 +94,117 @@ def find_room(rooms: tuple[Room, ...], wanted: str) -> int:
     raise InputError(f"room {wanted[:40]!r}: expected one of {shown}, or a number of 1 to {len(names)}")
 
 
-def rooms_of(position: Float64, rooms: tuple[Room, ...]) -> UInt16:
-    """Number of the first room that holds each world position (n, 3) [m], counting from 1; 0 outdoors."""
+def rooms_of(position: Float64, rooms: tuple[Room, ...], slack_m: float = 0.0) -> UInt16:
+    """Number of the first room that holds each world position (n, 3) [m], or whose box is that near, counting from 1; 0 outdoors."""
     found = np.full(len(position), ROOM_OUTDOORS, np.uint16)
-    for number in _reached(position, rooms, 0.0)[::-1]:
-        found[holds(rooms[number - 1], position)] = number
+    for number in _reached(position, rooms, slack_m)[::-1]:
+        near = _near(rooms[number - 1], position, slack_m)
+        found[near[holds(rooms[number - 1], position[near], slack_m)]] = number
     return found
 
 
-def holds(room: Room, position: Float64, slack_m: float = 0.0) -> Bool:
-    """Which world positions (n, 3) [m] lie in a room, or up to ``slack_m`` (at most a cell's width) outside it."""
+def holds(room: Room, position: Float64, slack_m: float = 0.0, grown: bool = False) -> Bool:
+    """Which world positions (n, 3) [m] lie in a room, or up to ``slack_m`` outside its box, and if ``grown`` a cell outside its cells."""
     low, high = np.array(room.minimum) - slack_m, np.array(room.maximum) + slack_m
     inside: Bool = np.asarray(((position >= low) & (position <= high)).all(axis=1), np.bool_)
     if room.cells is not None and inside.any():
         # The box ends at walls, cells beside them: what lies between the two is the room's.
-        cell = np.floor(position[inside] / ROOM_CELL_M).astype(np.int64) - room.cells.first
-        x, y, z = np.clip(cell, 0, np.array(room.cells.shape) - 1).T
-        inside[inside] = _air(room.cells, slack_m > 0)[y, z, x]
+        last = np.array(room.cells.shape) - 1
+        cell = np.clip(np.floor(position[inside] / room.cells.size_m).astype(np.int64) - room.cells.first, 0, last)
+        steps = np.concatenate([np.eye(3, dtype=np.int64), -np.eye(3, dtype=np.int64)]) if grown else ()
+        held = _is_air(room.cells, cell)
+        for step in steps:
+            held |= _is_air(room.cells, np.clip(cell + step, 0, last))
+        inside[inside] = held
     return inside
 
 
-def indoor_shares(position: Float64, rooms: tuple[Room, ...], surface: Float64 | None = None) -> tuple[UInt16, Float32]:
-    """How light sampled at world positions (n, 3) [m] is mixed: the room (n,), and its share (n,) 0..1; the rest is the outdoor volume's.
+def _is_air(cells: RoomCells, at: Int64) -> Bool:
+    """Which cells (n, 3), x, y, z from the first, hold the room's air."""
+    nx, _, nz = cells.shape
+    index = (at[:, 1] * nz + at[:, 2]) * nx + at[:, 0]
+    return np.asarray(np.frombuffer(cells.bits, np.uint8)[index >> 3] >> (index & 7).astype(np.uint8) & 1, np.bool_)
+
+
+@dataclass(frozen=True, eq=False)
+class Shares:
+    """How light is mixed, of which room or of the open air: entries (m,), of each point at least one, in no order.
+
+    point : (m,) int64, which of the positions; room : (m,) uint16, 0 outdoors; share : (m,) float32, above 0, summing to 1 for each point
+    """
+
+    point: Int64
+    room: UInt16
+    share: Float32
+
+    def of(self, number: int, count: int) -> Float32:
+        """(count,): the shares of one room, or of the open air, in the light of all positions."""
+        chosen = self.room == number
+        return np.bincount(self.point[chosen], self.share[chosen], count).astype(np.float32)
+
+
+def light_shares(position: Float64, rooms: tuple[Room, ...], surface: Float64 | None = None) -> Shares:
+    """How light sampled at world positions (n, 3) [m] is mixed from the volumes of rooms and of the open air.
 
     surface : (n, 3) [m], of what is lit, and 2 cm off it: volumes are sampled farther off. None: the positions themselves
 
-    Walls part the two sharply, whatever is how near. In an opening both are halves; on either side of it the other's share falls as the
-    opening does from view. From a wall beside an opening nothing is seen of it, so no bright or dark seam surrounds windows.
+    Walls part rooms sharply, whatever is how near. In an opening what lies on its two sides are halves, and so they are in a doorway, from
+    one room's side to the other's; farther off the other side's share falls as the opening does from view. From a wall beside an opening
+    nothing is seen of it, so no bright or dark seam surrounds windows.
     """
     surface = position if surface is None else surface
-    inside = rooms_of(position, rooms)
-    room, share = inside.copy(), (inside != ROOM_OUTDOORS).astype(np.float32)
-    for number in _reached(surface, rooms, OPENING_DEPTH_M + max((_reach(each) for each in rooms), default=0.0)):
-        here = np.flatnonzero((inside == number) | (inside == ROOM_OUTDOORS))
-        half = opening_nearness(rooms[number - 1], surface[here]) / 2
-        own = inside[here] == number
-        share[here[own]] = 1 - half[own]
-        nearer = ~own & (half > share[here])
-        room[here[nearer]], share[here[nearer]] = number, half[nearer]
-    return room, share
+    own = rooms_of(position, rooms).astype(np.int64)
+    outside = np.flatnonzero(own == ROOM_OUTDOORS)
+    own[outside] = rooms_of(position[outside], rooms, EDGE_M)
+    reached = _reached(surface, rooms, OPENING_DEPTH_M + max((_reach(each) for each in rooms), default=0.0))
+    parts: list[tuple[Int64, int, Float32]] = []
+    for number, door in ((each, door) for each in reached for door in rooms[each - 1].openings if door.to):
+        outside = np.flatnonzero(own == ROOM_OUTDOORS)
+        between = outside[_in_box(door, position[outside]) | _in_box(door, surface[outside])]
+        own[between] = _IN_DOORWAY
+        parts += [(between, beyond, np.full(len(between), 0.5, np.float32)) for beyond in (number, door.to)]
+    for number in reached:
+        room = rooms[number - 1]
+        near = _near(room, surface, OPENING_DEPTH_M + _reach(room))
+        for other in sorted({opening.to for opening in room.openings}):
+            # Doors between rooms are among those of both.
+            here = near[(own[near] == number) | ((own[near] == ROOM_OUTDOORS) & (other == ROOM_OUTDOORS))]
+            half = opening_nearness(room, surface[here], other) / 2
+            for inside, lends in ((number, other), (other, number)):
+                seen = (half > 0) & (own[here] == inside)
+                parts.append((here[seen], lends, half[seen]))
+    lent = np.zeros(len(position))
+    for at, _, share in parts:
+        np.add.at(lent, at, share)
+    rest = np.flatnonzero((lent < 1) & (own != _IN_DOORWAY))
+    point = np.concatenate([at for at, _, _ in parts] + [rest])
+    lender = np.concatenate([np.full(len(at), lends) for at, lends, _ in parts] + [own[rest]])
+    share = np.concatenate([share / np.maximum(lent[at], 1) for at, _, share in parts] + [1 - lent[rest]])
+    return Shares(point, lender.astype(np.uint16), share.astype(np.float32))
 
 
-def opening_nearness(room: Room, position: Float64) -> Float32:
-    """(n,) 0..1 at positions (n, 3) [m]: 1 in the openings of a room, 0 where each fills less than OPENING_LEAST_VIEW of half the view.
+def _near(room: Room, position: Float64, reach_m: float) -> Int64:
+    """Which positions (n, 3) [m] lie within a way of a room's box, along each axis."""
+    near = np.arange(len(position))
+    for axis in range(3):  # one after another: most are far along the first
+        along = position[near, axis]
+        near = near[(along >= room.minimum[axis] - reach_m) & (along <= room.maximum[axis] + reach_m)]
+    return near
+
+
+def _in_box(opening: Opening, position: Float64) -> Bool:
+    return np.asarray(((position >= opening.minimum) & (position <= opening.maximum)).all(axis=1), np.bool_)
+
+
+def opening_nearness(room: Room, position: Float64, to: int = ROOM_OUTDOORS) -> Float32:
+    """(n,) 0..1 at positions (n, 3) [m]: 1 in the openings of a room to another, or to the open air, 0 where each fills less than
+    OPENING_LEAST_VIEW of half the view.
 
     An opening is the rectangle across the shortest side of its box, seen from as much nearer as that is deep and OPENING_DEPTH_M; from
     x and y off its corners, at a distance d, it has a solid angle of the sum of +- atan(x y / (d sqrt(x^2 + y^2 + d^2))).
     """
     nearness = np.zeros(len(position), np.float32)
-    for opening in room.openings:
+    for opening in (each for each in room.openings if each.to == to):
         low, high = np.array(opening.minimum), np.array(opening.maximum)
         reach = OPENING_DEPTH_M + _reach_of(opening)
         near = np.flatnonzero(((position >= low - reach) & (position <= high + reach)).all(axis=1))
@@ -166,10 +232,11 @@ def _reach(room: Room) -> float:
     return max((_reach_of(opening) for opening in room.openings), default=0.0)
 
 
-def weight_lattice(first_voxel: Int64, rooms: tuple[Room, ...], numbers: tuple[int, ...]) -> UInt8:
+def weight_lattice(first_voxel: Int64, rooms: tuple[Room, ...], numbers: tuple[int, ...], to: int = ROOM_OUTDOORS) -> UInt8:
     """Where a volume's rooms are, and how near their openings, in a quarter of its voxels' size: (2, 64, 128, 128), y, z, x.
 
-    Plane 0 is 255 in the rooms of those ``numbers`` and 0 outside them; plane 1 is 255 times ``opening_nearness`` of the closest of them.
+    Plane 0 is 255 in the rooms of those ``numbers`` and 0 outside them; plane 1 is 255 times ``opening_nearness`` of the closest of them,
+    of openings to the open air or to the room ``to``. In doorways to that one plane 0 is 127.
     """
     shape = tuple(WEIGHT_CELLS * n for n in VOLUME_SHAPE)
     found = np.zeros((2, *shape), np.uint8)
@@ -187,33 +254,30 @@ def weight_lattice(first_voxel: Int64, rooms: tuple[Room, ...], numbers: tuple[i
         part = (near[1], near[2], near[0])
         y, z, x = np.meshgrid(axes[1][near[1]], axes[2][near[2]], axes[0][near[0]], indexing="ij")
         position = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
-        for plane, value in enumerate((holds(room, position).astype(np.float32), opening_nearness(room, position))):
+        inside = holds(room, position).astype(np.float32)
+        for door in (each for each in room.openings if each.to == to != ROOM_OUTDOORS):
+            between = _in_box(door, position) & ~holds(rooms[to - 1], position)
+            inside = np.where(between, np.maximum(inside, np.float32(127 / 255)), inside)
+        for plane, value in enumerate((inside, opening_nearness(room, position, to))):
             here = found[(plane, *part)]
             np.maximum(here, np.round(255 * value.reshape(here.shape)).astype(np.uint8), out=here)
     return found
 
 
-def pack_cells(at: Int64) -> RoomCells:
-    """The cells of a room, at least one, by their lattice indices (n, 3), x, y, z."""
+def pack_cells(at: Int64, size_m: float = ROOM_CELL_M) -> RoomCells:
+    """The cells of a room, at least one, by their lattice indices (n, 3), x, y, z; ``size_m`` is a cell's width [m]."""
     x, y, z = at.min(axis=0).tolist()
     nx, ny, nz = (np.ptp(at, axis=0) + 1).tolist()
     air = np.zeros((ny, nz, nx), np.bool_)
     air[tuple((at - [x, y, z]).T[[1, 2, 0]])] = True
-    return RoomCells((x, y, z), (nx, ny, nz), np.packbits(air.reshape(-1), bitorder="little").tobytes())
+    return RoomCells((x, y, z), (nx, ny, nz), np.packbits(air.reshape(-1), bitorder="little").tobytes(), size_m)
 
 
-@lru_cache(maxsize=1024)
-def _air(cells: RoomCells, grown: bool) -> Bool:
-    """Which cells (ny, nz, nx) hold the room's air; ``grown`` : or have one beside them that does."""
+def air_of(cells: RoomCells) -> Bool:
+    """Which cells (ny, nz, nx) hold the room's air."""
     nx, ny, nz = cells.shape
-    air = np.unpackbits(np.frombuffer(cells.bits, np.uint8), count=nx * ny * nz, bitorder="little").astype(np.bool_).reshape(ny, nz, nx)
-    if grown:
-        for axis in range(3):
-            beside = np.moveaxis(air.copy(), axis, 0)
-            air_along = np.moveaxis(air, axis, 0)
-            air_along[1:] |= beside[:-1]
-            air_along[:-1] |= beside[1:]
-    return air
+    bits = np.unpackbits(np.frombuffer(cells.bits, np.uint8), count=nx * ny * nz, bitorder="little")
+    return np.asarray(bits.astype(np.bool_).reshape(ny, nz, nx))
 
 
 def _reached(position: Float64, rooms: tuple[Room, ...], margin_m: float) -> list[int]:

@@ -1,5 +1,6 @@
 """What a whole world has: where on Earth it lies, its rooms, lamps and decals. Part of world.json; no geometry."""
 
+import re
 from dataclasses import dataclass
 from datetime import date
 from typing import Any
@@ -7,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from gi_core.arrays import Float64
+from gi_core.constants import ROOM_CELL_M
 
 
 @dataclass(frozen=True)
@@ -32,30 +34,37 @@ class Location:
 
 @dataclass(frozen=True)
 class Opening:
-    """An axis-aligned box, most often flat, in which the air of a room meets the open air. ``minimum`` and ``maximum`` as of a room."""
+    """An axis-aligned box, most often flat, in which the air of a room meets the open air, or that of another room.
+
+    minimum, maximum : as of a room
+    to : the number of the other room, from 1; 0 is the open air
+    """
 
     minimum: tuple[float, float, float]
     maximum: tuple[float, float, float]
+    to: int = 0
 
 
 @dataclass(frozen=True)
 class RoomCells:
-    """The shape of a found room: which cells of ROOM_CELL_M of its box hold its air.
+    """The shape of a room that is no box: which cells of its box hold its air.
 
     first : world lattice index (x, y, z) of cell (0, 0, 0); shape : cells along x, y, z
     bits : a bit a cell, x fastest, then z, then y, the lowest bit of each byte first
+    size_m : a cell's width [m], each way; lattices begin at the world's origin
     """
 
     first: tuple[int, int, int]
     shape: tuple[int, int, int]
     bits: bytes
+    size_m: float = ROOM_CELL_M
 
 
 @dataclass(frozen=True)
 class Room:
     """Indoor air: an axis-aligned box, or the cells of one. ``minimum`` and ``maximum`` are world positions (x, y, z) [m].
 
-    cells : of a room that the bake found; None of an author's, who drew a box
+    cells : of a room that the bake found, or whose author drew a mesh; None of one that is its box
     """
 
     name: str
@@ -67,11 +76,16 @@ class Room:
     @property
     def is_found(self) -> bool:
         """Whether the bake found it, and no author drew it."""
-        return self.cells is not None
+        return self.cells is not None and is_found_name(self.name)
 
     def box_json(self) -> dict[str, Any]:
         """What an author says of it, as JSON has it."""
         return {"name": self.name, "minimum": self.minimum, "maximum": self.maximum}
+
+
+def is_found_name(name: str) -> bool:
+    """Whether a room of that name, where it is no box, was found by the bake: ``found-1`` and so on."""
+    return re.fullmatch(r"found-[0-9]+", name) is not None
 
 
 LAMP_KINDS = ("point", "spot", "area")

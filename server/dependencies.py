@@ -86,6 +86,11 @@ class VolumeQuery(PositionQuery, VolumeFormatQuery):
     weight: bool = Field(
         False, description="of kind=interior, 1: where its rooms are and how near their openings, instead of light: uint8, npy or raw"
     )
+    to: str | None = Field(
+        None,
+        max_length=200,
+        description="of weight, a name or number: how near the room's doors to that one are, instead of its other openings",
+    )
     basis: Literal["cube", "sh1", "sh2"] = Field(
         "cube", description="cube: +X -X +Y -Y +Z -Z; harmonics: 4 or 9 coefficients, where `/v1/world` says that they can be had"
     )
@@ -99,6 +104,8 @@ class VolumeQuery(PositionQuery, VolumeFormatQuery):
             raise ValueError("room with kind=interior only")
         if self.weight and (self.kind != "interior" or self.mask or self.format == "ktx2"):
             raise ValueError("weight with kind=interior, format=npy or raw, and no mask")
+        if self.to is not None and (not self.weight or self.room is None):
+            raise ValueError("to with weight=1 and room only")
         if self.kind == "interior" and self.cascade != 0:
             raise ValueError("cascade=0 of kind=interior")
         if self.kind == "fog" and self.basis != "cube":
@@ -172,6 +179,9 @@ class PreviewQuery(LightingQuery):
         "on", description="off: direct light only; split: left off, right on; error: against a path tracer, in false colour"
     )
     distant: Beyond = Field("on", description="beyond the volumes: the distant texture, or off; client: beyond the eye's one volume")
+    distant_light: DistantLight | None = Field(
+        None, description="of the distant texture the sky's light alone, or with sun, lamps and bounces; none: the best that was baked"
+    )
     interior: Literal["on", "off"] = Field("on", description="off: rooms are lit by the outdoor volume, as without interior ones")
     ao: Literal["on", "off"] = Field("off", description="on: what stands within 3 m, and decals, dim indirect light")
     view: Literal["lit"] | ViewName = Field("lit", description="what lies behind the picture, in false colours or as spheres")
@@ -184,6 +194,8 @@ class PreviewQuery(LightingQuery):
 
     @model_validator(mode="after")
     def _one_kind(self) -> "PreviewQuery":
+        if self.distant_light is not None and self.distant == "off":
+            raise ValueError("distant_light with distant=on or client only")
         if self.gi == "error" and self.view != "lit":
             raise ValueError("either gi=error or another view than lit, not both")
         return self

@@ -1,6 +1,6 @@
 """JSON replies. Field names are contract: clients read them."""
 
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import BaseModel, Field
 
@@ -104,15 +104,21 @@ class OpeningReply(BaseModel):
     maximum: Vector3
 
 
+class DoorReply(OpeningReply):
+    to: int = Field(description="number of the other room")
+
+
 class RoomReply(BaseModel):
     number: int = Field(description="from 1; probes and interior volumes name rooms so")
     name: str
     minimum: Vector3
     maximum: Vector3
-    found: bool = Field(description="the bake found it; of its box only the cells of `kind=interior&weight=1` are its air")
+    shape: Literal["box", "cells"] = Field(description="cells: of its box only those of `kind=interior&weight=1` are its air, as of a mesh")
+    found: bool = Field(description="the bake found it, and no author drew it")
     openings: list[OpeningReply] = Field(
         description="boxes, most of them flat, in which its air meets the open air: windows, and doors, which go on below the floor"
     )
+    doors: list[DoorReply] = Field(description="the same between it and other rooms, from its side of the wall to theirs; each is in both")
 
 
 class WorldReply(BaseModel):

@@ -16,6 +16,7 @@ from typing import Literal
 import numpy as np
 
 from gi_core.arrays import Float32, Float64, Int32, Int64
+from gi_core.distant_file import DistantLight
 from gi_core.engine import Engine
 from gi_core.lighting import Lighting
 from gi_core.lights import lamps_on
@@ -44,12 +45,14 @@ class Look:
     distant : what lies beyond the volumes; on: the distant texture, off: the nearest volume's edge, client: the texture beyond the one
         volume around the eye
     interior : whether rooms are lit by their interior volumes, or by the outdoor one
+    distant_light : what the distant texture knows: the sky alone, or all light; None is the best that was baked
     """
 
     indirect: Indirect = "on"
     distant: Beyond = "on"
     occlusion: bool = False
     interior: bool = True
+    distant_light: DistantLight | None = None
 
 
 PLAIN_LOOK = Look()
@@ -58,8 +61,8 @@ PLAIN_LOOK = Look()
 def city_radiance(
     engine: Engine, scene: PreviewScene, camera: Camera, lighting: Lighting, look: Look = PLAIN_LOOK, settings: Settings = NEUTRAL
 ) -> Float32:
-    """``render`` with an engine's lamps and light, under the artists' settings. Raises CorruptFileError."""
-    served = ServedLight.of(engine, lighting, settings, look.distant, camera.eye, look.interior)
+    """``render`` with an engine's lamps and light, under the artists' settings. Raises as ``ServedLight.of``."""
+    served = ServedLight.of(engine, lighting, settings, look.distant, camera.eye, look.interior, look.distant_light)
     lamps = settings.brightened(lamps_on(engine.lamps, lighting))
     return render(camera, scene, settings.light(lighting), lamps, served, look)
 

@@ -42,7 +42,7 @@ def error_picture(service: Service, camera: Camera, lighting: Lighting, look: Lo
         hit = np.flatnonzero(surface.hit)
         if len(hit):
             position, normal = surface.position[hit], surface.normal[hit]
-            light = ServedLight.of(service.engine, lighting, NEUTRAL, look.distant, camera.eye, look.interior)
+            light = ServedLight.of(service.engine, lighting, NEUTRAL, look.distant, camera.eye, look.interior, look.distant_light)
             served = indirect_irradiance(scene.rays, light, look, position, normal) @ LUMINANCE_FROM_RGB
             error[hit] = relative_error(served, _traced(service, camera, lighting, position, normal))
     picture = Image.fromarray(false_colour(error.reshape(coarse.height, coarse.width)))

@@ -1,6 +1,6 @@
 """Served light as a picture reads it: volumes, and beyond them the texture of distant sectors (slide "Distant shading").
 
-    in a room              its interior volume; at its openings, on both sides, a mix with the outdoor one (gi_core.rooms.indoor_shares)
+    in a room              its interior volume; at its openings, on both sides, a mix with what is beyond (gi_core.rooms.light_shares)
     in a volume's box      the volume
     up to FADE_M beyond    its edge, faded into the texture
     farther                the texture alone
@@ -18,10 +18,11 @@ from gi_core import ambient_cube
 from gi_core.arrays import Float32, Float64, Int64
 from gi_core.basis import average
 from gi_core.constants import ROOM_OUTDOORS, SECTOR_SIZE_M, VOLUME_SHAPE, VOXEL_SIZE_M
+from gi_core.distant_file import DistantLight
 from gi_core.engine import Distant, Engine
 from gi_core.errors import InputError
 from gi_core.lighting import Lighting
-from gi_core.rooms import indoor_shares
+from gi_core.rooms import light_shares
 from gi_core.settings import Settings
 from gi_core.volume import Volume, sample_coefficients, sample_volume
 from gi_core.world import Decal, Room
@@ -68,10 +69,17 @@ class ServedLight:
 
     @classmethod
     def of(
-        cls, engine: Engine, lighting: Lighting, settings: Settings, beyond: Beyond, eye: Float64, interior: bool = True
+        cls,
+        engine: Engine,
+        lighting: Lighting,
+        settings: Settings,
+        beyond: Beyond,
+        eye: Float64,
+        interior: bool = True,
+        distant_light: DistantLight | None = None,
     ) -> "ServedLight":
         """An engine's light under the artists' settings, seen from an eye (3,) [m]. Without ``interior`` volumes rooms are lit by the
-        outdoor one. Raises CorruptFileError."""
+        outdoor one; None of ``distant_light`` is the best that was baked. Raises InputError for one that was not, CorruptFileError."""
         low, high = engine.dataset.world.bounds
 
         def volume_at(position: Float64, room: int) -> Volume:
@@ -82,7 +90,7 @@ class ServedLight:
             except InputError:  # a closet between voxels, or out of the one volume's reach
                 return engine.volume(inside, lighting, settings)
 
-        distant = None if beyond == "off" else engine.distant(settings.light(lighting))
+        distant = None if beyond == "off" else engine.distant(settings.light(lighting), distant_light)
         world = engine.dataset.world
         return cls(volume_at, distant, eye if beyond == "client" else None, world.rooms if interior else (), world.decals)
 
@@ -116,12 +124,10 @@ class ServedLight:
     def _parts(self, points: Float64, surface: Float64, most: int) -> Iterator[tuple[Volume, Int64, Float32, bool]]:
         """Volumes, at most ``most`` of each room and of the open air, the points (k,) that each lights, its share of their light (k,), and
         whether it is a room's. The shares of a point sum to 1."""
-        room, indoors = indoor_shares(points, self.rooms, surface)
-        for number in np.unique(np.append(room[indoors > 0], ROOM_OUTDOORS)).tolist():
-            share = np.where(room == number, indoors, 0) if number else 1 - indoors
+        shares = light_shares(points, self.rooms, surface)
+        for number in np.unique(shares.room).tolist():
+            share = shares.of(number, len(points))
             there = np.flatnonzero(share > 0)
-            if not len(there):
-                continue
             if self.player is None:
                 centres, which = plan_volumes(points[there], most)
             else:

@@ -24,8 +24,9 @@ def preview(request: Request, service: ServiceDep, query: Annotated[PreviewQuery
     `gi=off`: direct light only; `split`: left off, right on; `error`: the indirect light's error against a path tracer in false colour
     (blue: too dark, red: too bright, by half and more), which takes some seconds.
     `distant`: beyond the volumes the texture of /v1/distant takes over (`on`), or not (`off`: the nearest volume's edge). A picture takes
-    as many volumes as its pixels need, up to 128; `client` shows what one has who holds only the volume around the eye. `interior=off`
-    lights rooms by the outdoor volume, as one sees them who never asks for `kind=interior`.
+    as many volumes as its pixels need, up to 128; `client` shows what one has who holds only the volume around the eye. Of the texture
+    `distant_light=sky` takes the sky's light alone, as in the talk, `full` all of it; left out it is the best that was baked.
+    `interior=off` lights rooms by the outdoor volume, as one sees them who never asks for `kind=interior`.
 
     `ao=on` dims indirect light by what stands within 3 m, which a volume's voxels cannot see. Against the path tracer it mends corners;
     where the volumes are too dark already, as under an overcast sky, it makes them darker. The decals of `/v1/decals` dim it besides.
@@ -44,7 +45,7 @@ def preview(request: Request, service: ServiceDep, query: Annotated[PreviewQuery
 def picture(service: Service, query: PreviewQuery, light: Lighting) -> bytes:
     """The PNG that a query asks for."""
     camera = Camera(parse_vector(query.eye), parse_vector(query.look), query.fov, query.width)
-    look = Look("on" if query.gi == "error" else query.gi, query.distant, query.ao == "on", query.interior == "on")
+    look = Look("on" if query.gi == "error" else query.gi, query.distant, query.ao == "on", query.interior == "on", query.distant_light)
     with service.preview_turn():
         if query.view != "lit":
             scene = service.preview_scenes.around(camera.eye, camera.look)

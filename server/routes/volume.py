@@ -9,9 +9,9 @@ from fastapi import APIRouter, Query, Request, Response
 
 from gi_core.arrays import AnyArray, Float32, UInt8
 from gi_core.basis import average
-from gi_core.constants import CUBE_FACES
+from gi_core.constants import CUBE_FACES, ROOM_OUTDOORS
 from gi_core.errors import InputError
-from gi_core.rooms import WEIGHT_CELLS, weight_lattice
+from gi_core.rooms import WEIGHT_CELLS, find_room, weight_lattice
 from gi_core.volume import Volume
 from gi_core.world import Room
 from server import ktx2
@@ -49,13 +49,17 @@ def volume(request: Request, service: ServiceDep, query: Annotated[VolumeQuery, 
 
     `kind=outdoor`: no light of rooms; a voxel in one holds what the nearest one outdoors has. `kind=interior`: of a room alone; every other
     voxel holds what the nearest inside has, and `rooms` in the header places its box: inside it sample this volume, else the outdoor
-    one. `kind=fog`: outdoor light averaged over directions, (16, 32, 32, 3).
+    one; a room whose `shape` in `/v1/world` is `cells` is of that only where plane 0 of `weight=1` is 255. `kind=fog`: outdoor light
+    averaged over directions, (16, 32, 32, 3).
     `kind=interior&weight=1`: what makes a step through a door smooth, in cells of a quarter voxel, uint8 (2, 64, 128, 128). Plane 0, read
     at the nearest cell, is 255 in the rooms and 0 outside; plane 1, read linearly, n = 0..1 as 0..255, tells how much an opening fills the
     view. The share of the interior volume is 1 - n / 2 inside and n / 2 outside: sharp at walls, continuous through openings. Read plane 0
     where volumes are sampled, plane 1 on the surface that is lit, 2 cm off it. From the openings of `/v1/world` n can be had exactly: of
     each box take the rectangle across its shortest side, and its solid angle from 0.390625 m nearer than one is; n = clamp((angle / 2 pi -
     0.25) / 0.75).
+    `&room=A&to=B` is the same for the doors from A to another room B, `doors` of `/v1/world`, with both rooms' volumes: the share of B is
+    n / 2 in A, that of A n / 2 in B, and each has a half in the doorway, where plane 0 is 127. Where a room has doors and other openings
+    near, take all of their shares from it.
     `cascade=1..3`: voxels of twice, four and eight times the size, means of those inside them; `-1`: of half the size, where `/v1/world`
     says so. Each cascade covers the middle of the next: blend from one to the other over the last two voxels of the smaller.
     `mask=1`: uint8 (16, 32, 32), 0 solid, 1 outdoors, 2 indoors, 3 no sector there. The header `Gi-Volume` places it in the world.
@@ -76,7 +80,7 @@ def volume(request: Request, service: ServiceDep, query: Annotated[VolumeQuery, 
         with laps.lap("encode"):
             rooms = service.dataset.world.rooms
             if query.weight:
-                body = weight_body(found, query, rooms)
+                body = weight_body(found, query, rooms, query.to)
             else:
                 body = mask_body(found, query, rooms) if query.mask else light_body(found, query, rooms, is_fog=query.kind == "fog")
         return replace(body, headers={**body.headers, "Gi-Residual": f"{found.residual:.2g}"})
@@ -132,9 +136,17 @@ def bytes_body(found: Volume, values: UInt8, query: VolumeFormatQuery, facts: Ma
     return _body(content, query, described)
 
 
-def weight_body(found: Volume, query: VolumeFormatQuery, rooms: tuple[Room, ...]) -> Body:
-    """Where an interior volume's rooms are, and how near their openings, in cells of a quarter voxel."""
-    lattice = weight_lattice(found.first_voxel, rooms, found.rooms)
+def weight_body(found: Volume, query: VolumeFormatQuery, rooms: tuple[Room, ...], to: str | None = None) -> Body:
+    """Where an interior volume's rooms are, and how near their openings, in cells of a quarter voxel; ``to`` names the room behind them.
+
+    Raises InputError for a room that no door leads to.
+    """
+    beyond = ROOM_OUTDOORS if to is None else find_room(rooms, to)
+    behind = {opening.to for number in found.rooms for opening in rooms[number - 1].openings if opening.to}
+    if to is not None and beyond not in behind:
+        shown = ", ".join(repr(rooms[number - 1].name[:40]) for number in sorted(behind)[:8]) or "none"
+        raise InputError(f"to: expected a room behind a door ({shown}), found {to[:40]!r}")
+    lattice = weight_lattice(found.first_voxel, rooms, found.rooms, beyond)
     size = found.voxel_size / WEIGHT_CELLS
     corner = found.origin - found.voxel_size / 2
     placed = {"origin": (corner + size / 2).tolist(), "voxel_size": size.tolist(), "unit": "1"}

@@ -5,7 +5,7 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Request, Response
 
 from gi_core.basis import served_from
-from gi_core.constants import MAX_PROBES_PER_SECTOR, SECTOR_SIZE_M, VOLUME_SHAPE, VOXEL_SIZE_M
+from gi_core.constants import MAX_PROBES_PER_SECTOR, ROOM_OUTDOORS, SECTOR_SIZE_M, VOLUME_SHAPE, VOXEL_SIZE_M
 from gi_core.dataset import Dataset, WorldInfo
 from gi_core.errors import FormatError
 from gi_core.weather import WEATHER_RANGES, weather_presets
@@ -13,7 +13,7 @@ from gi_core.world import Room
 from server.caching import Body, conditional, strong_etag
 from server.dependencies import MAX_CASCADE, MAX_DECAL_RADIUS_M, MAX_PREVIEW_WIDTH, MAX_PROBE_RADIUS_M, NoQuery, ServiceDep
 from server.encoding import REPLY_VERSION
-from server.models import BoundsReply, LimitsReply, LocationReply, OpeningReply, RoomReply, SectorGridReply, WorldReply, vector3
+from server.models import BoundsReply, DoorReply, LimitsReply, LocationReply, OpeningReply, RoomReply, SectorGridReply, WorldReply, vector3
 
 router = APIRouter(prefix="/v1", tags=["dataset"])
 
@@ -78,9 +78,19 @@ def world_reply(dataset: Dataset) -> WorldReply:
 
 
 def room_reply(number: int, room: Room) -> RoomReply:
-    """A room, and where its air meets the open air."""
-    openings = [OpeningReply(minimum=opening.minimum, maximum=opening.maximum) for opening in room.openings]
-    return RoomReply(number=number, name=room.name, minimum=room.minimum, maximum=room.maximum, found=room.is_found, openings=openings)
+    """A room, and where its air meets the open air and that of other rooms."""
+    openings = [OpeningReply(minimum=each.minimum, maximum=each.maximum) for each in room.openings if each.to == ROOM_OUTDOORS]
+    doors = [DoorReply(minimum=each.minimum, maximum=each.maximum, to=each.to) for each in room.openings if each.to != ROOM_OUTDOORS]
+    return RoomReply(
+        number=number,
+        name=room.name,
+        minimum=room.minimum,
+        maximum=room.maximum,
+        shape="box" if room.cells is None else "cells",
+        found=room.is_found,
+        openings=openings,
+        doors=doors,
+    )
 
 
 def sector_grid(info: WorldInfo) -> SectorGridReply:

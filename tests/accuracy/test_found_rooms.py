@@ -17,7 +17,7 @@ from gi_core.constants import OPENING_LEAST_VIEW, VOXEL_INDOORS
 from gi_core.dataset import Dataset
 from gi_core.engine import Engine
 from gi_core.grid import SectorIndex
-from gi_core.rooms import indoor_shares
+from gi_core.rooms import light_shares
 from gi_core.volume import sample_volume
 from gi_core.world import Lamp, Location
 
@@ -74,8 +74,7 @@ def seen(engine: Engine, lighting, room: int, where: tuple[np.ndarray, np.ndarra
     outdoor = engine.volume(np.array([24.0, 3.0, 20.0]), lighting)
     indoor = engine.interior(np.array([24.0, 3.0, 20.0]), lighting, room=str(room))
     at = points + indoor.voxel_size / 4 * normals
-    number, share = indoor_shares(at, engine.dataset.world.rooms, points)
-    share = np.where(number == room, share, 0)
+    share = light_shares(at, engine.dataset.world.rooms, points).of(room, len(points))
     light = [sample_volume(v.values, v.origin, v.voxel_size, points, normals)[:, 1] for v in (outdoor, indoor)]
     return light[0] + share * (light[1] - light[0])
 
@@ -131,12 +130,12 @@ def test_walls_stay_sharp_beside_a_door(engine):
     rooms = engine.dataset.world.rooms
     within = np.array([[36.15, 1, 40], [51.85, 1, 40], [44, 1, 45.85], [44, 4.85, 40], [38, 1, 30.15]])
     beyond = np.array([[35.85, 1, 40], [52.15, 1, 40], [44, 1, 46.15], [44, 5.25, 40], [38, 1, 29.85]])
-    assert [part.tolist() for part in indoor_shares(within, rooms)] == [[HALL] * 5, [1.0] * 5]
-    assert [part.tolist() for part in indoor_shares(beyond, rooms)] == [[0] * 5, [0.0] * 5]
+    assert light_shares(within, rooms).of(HALL, 5).tolist() == [1.0] * 5
+    assert light_shares(beyond, rooms).of(0, 5).tolist() == [1.0] * 5
     # On the wall itself not even a hand's breadth from the door: surfaces do not see what lies in their own plane.
     jamb = np.array([[43.1, 1, 30.12], [43.1, 1, 29.88], [44.9, 1, 30.12], [44, 2.6, 30.12]])
     off = jamb + np.array([[0, 0, 0.78], [0, 0, -0.78], [0, 0, 0.78], [0, 0, 0.78]])
-    assert [part.tolist() for part in indoor_shares(off, rooms, jamb)] == [[HALL, 0, HALL, HALL], [1.0, 0.0, 1.0, 1.0]]
+    assert light_shares(off, rooms, jamb).of(HALL, 4).tolist() == [1.0, 0.0, 1.0, 1.0]
 
 
 def test_a_room_across_a_border_is_one_and_its_bytes_depend_on_no_order(build):

@@ -10,7 +10,7 @@ from bake_jobs.room_search import world_rooms
 from bake_jobs.scene_source import load_scene
 from gi_core.constants import ROOM_CELL_M
 from gi_core.errors import SourceError
-from gi_core.rooms import holds, rooms_of
+from gi_core.rooms import holds, light_shares, rooms_of
 from gi_core.world import Room
 
 WALL = 0.2
@@ -84,8 +84,45 @@ def test_two_rooms_with_a_door_between_are_two(ground):
     block.wall((15, 19.9), (15, 26.1), 2.8, [(2.0, -0.1, 3.0, 2.0)])
     first, second = found(block)
     assert (first.maximum[0], second.minimum[0]) == pytest.approx((14.9, 15.1), abs=2e-3)
-    # The inner door leads to no open air; only the first room has a door and a window of its own.
-    assert (len(first.openings), len(second.openings)) == (2, 0)
+    # Only the first room has a door and a window of its own. The door between is one box through the wall, and among both rooms' own.
+    assert ([each.to for each in first.openings], [each.to for each in second.openings]) == ([0, 0, 2], [1])
+    door = first.openings[-1]
+    assert second.openings[0] == replace(door, to=1)
+    np.testing.assert_allclose((door.minimum, door.maximum), ((14.9, -2.0, 21.9), (15.1, 2.0, 22.9)), atol=0.012)
+    # On the way from one to the other nothing is the street's.
+    x = np.arange(12.0, 18.0, 0.05)
+    for height in (0.05, 1.5, 1.95):
+        way = np.stack([x, np.full(len(x), height), np.full(len(x), 22.4)], axis=1)
+        assert not light_shares(way, (first, second)).of(0, len(x)).any()
+
+
+def test_doors_join_drawn_rooms_and_found_ones(ground):
+    block = house(ground, (10, 20), (20, 26))
+    block.wall((15, 19.9), (15, 26.1), 2.8, [(2.0, -0.1, 3.0, 2.0)])
+    drawn = Room("front", (10.0, 0.0, 20.0), (14.9, 2.79, 26.0))
+    front, back = found(block, rooms=(drawn,))
+    assert (front.name, back.name) == ("front", "found-1")
+    assert ([each.to for each in front.openings], [each.to for each in back.openings]) == ([0, 0, 2], [1])
+    # Nobody asked for the room behind: the door leads to air that is in no room.
+    (alone,) = found(block, "none", rooms=(drawn,))
+    assert [each.to for each in alone.openings] == [0, 0, 0]
+    boxes = (drawn, Room("back", (15.1, 0.0, 20.0), (20.0, 2.79, 26.0)))
+    for rooms in (boxes, boxes[::-1]):
+        assert [sorted(each.to for each in room.openings) for room in found(block, "none", rooms=rooms)] == (
+            [[0, 0, 2], [1]] if rooms == boxes else [[2], [0, 0, 1]]
+        )
+
+
+def test_rooms_that_touch_or_overlap_open_into_each_other_where_one_ends(ground):
+    """Two drawn in one hall: side by side, and one over the other, whose own is what the first leaves."""
+    block = house(ground, (10, 20), (20, 26), door=False, window=False)
+    west = Room("west", (10.0, 0.0, 20.0), (15.0, 2.79, 26.0))
+    for east in (Room("east", (15.0, 0.0, 20.0), (20.0, 2.79, 26.0)), Room("east", (13.0, 0.0, 20.0), (20.0, 2.79, 26.0))):
+        rooms = found(block, "none", rooms=(west, east))
+        for room, to in zip(rooms, (2, 1), strict=True):
+            (seam,) = room.openings
+            assert seam.to == to
+            np.testing.assert_allclose((seam.minimum, seam.maximum), ((15, -2.79, 20), (15, 2.79, 26)), atol=0.011)
 
 
 def test_what_the_street_or_the_sky_reaches_is_no_room(build):

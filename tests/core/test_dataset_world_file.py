@@ -7,6 +7,7 @@ import json
 import shutil
 import sys
 import zlib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from bake_jobs.runner import bake
+from gi_core.constants import ROOM_CELL_M
 from gi_core.dataset import MAX_WORLD_BYTES, Dataset, WorldInfo, write_world
 from gi_core.errors import CorruptFileError, FormatError, FormatVersionError, InputError, SectorlightError
 from gi_core.grid import SectorIndex
@@ -54,9 +56,9 @@ def test_what_is_written_is_what_is_read(tmp_path):
     assert world.counts["probes"] == sum(facts["probes"] for facts in RECORD["sectors"].values())
 
 
-@pytest.mark.parametrize("version", [0, 6, 999])
+@pytest.mark.parametrize("version", [0, 7, 999])
 def test_another_version_is_named_and_says_what_to_do(version):
-    with pytest.raises(FormatVersionError, match=rf"city/world\.json: dataset version {version}, .* versions 1 to 5; bake it again"):
+    with pytest.raises(FormatVersionError, match=rf"city/world\.json: dataset version {version}, .* versions 1 to 6; bake it again"):
         read(at("version", to=version))
 
 
@@ -164,6 +166,48 @@ def test_a_found_room_that_is_none_is_refused_by_name(place, wrong):
         read(record)
 
 
+RECORD_6 = json.loads((GOLDEN.parent / "v6_sector2" / "world.json").read_bytes())
+
+
+def test_version_6_has_doors_between_rooms_and_cells_of_any_width_and_no_other_has():
+    world = read(RECORD_6)
+    assert json.loads(json.dumps(world.to_json())) == RECORD_6
+    hall, vault = world.rooms
+    door = Opening((50.0, 0.0, 43.0), (50.25, 2.0, 44.0), 2)
+    assert hall.openings == (Opening((43.0, 0.0, 40.0), (44.0, 2.0, 40.0)), door)
+    assert (vault.name, vault.is_found, vault.openings) == ("vault", False, (replace(door, to=1),))
+    assert vault.cells.size_m == ROOM_CELL_M / 4
+    at = np.array([[50.5, 1, 41], [50.5, 1, 43], [56, 1, 41], [56, 1, 43]])
+    assert rooms_of(at, world.rooms).tolist() == [2, 2, 2, 0]
+    # Without either it is of version 5, whose cells are of one width.
+    before = copy.deepcopy(RECORD_6)
+    before["rooms"] = [before["rooms"][0] | {"openings": before["rooms"][0]["openings"][:1]}]
+    assert read(before).version == 5
+    with pytest.raises(CorruptFileError, match="unknown"):
+        read(RECORD_5 | {"rooms": RECORD_6["rooms"]})
+
+
+@pytest.mark.parametrize(
+    ("place", "wrong"),
+    [
+        ((0, "openings", 1, "to"), 3),
+        ((0, "openings", 1, "to"), 1),
+        ((0, "openings", 1, "to"), -1),
+        ((0, "openings", 1, "to"), 1.5),
+        ((1, "cells", "size_m"), 0),
+        ((1, "cells", "size_m"), "0.4"),
+    ],
+)
+def test_a_door_to_nowhere_and_cells_of_no_width_are_refused_by_name(place, wrong):
+    record = copy.deepcopy(RECORD_6)
+    within = record["rooms"]
+    for name in place[:-1]:
+        within = within[name]
+    within[place[-1]] = wrong
+    with pytest.raises(CorruptFileError, match=rf"rooms.*{place[1]}.*{place[-1]}: expected.*; bake it again"):
+        read(record)
+
+
 def test_more_decals_than_the_limit_are_refused(monkeypatch):
     monkeypatch.setattr("gi_core.dataset.MAX_DECALS", 1)
     with pytest.raises(CorruptFileError, match="decals: expected a list of at most 1"):
@@ -171,14 +215,14 @@ def test_more_decals_than_the_limit_are_refused(monkeypatch):
 
 
 def test_info_exits_with_2_and_one_line_for_another_version(tmp_path, monkeypatch, capsys):
-    (tmp_path / "world.json").write_text(json.dumps(at("version", to=7)))
+    (tmp_path / "world.json").write_text(json.dumps(at("version", to=8)))
     monkeypatch.setattr(sys, "argv", ["sectorlight", "info", str(tmp_path)])
     with pytest.raises(SystemExit) as ended:
         main()
     out, err = capsys.readouterr()
     assert (ended.value.code, out) == (2, "")
     assert err.count("\n") == 1
-    assert "version 7" in err
+    assert "version 8" in err
     assert "bake it again" in err
 
 

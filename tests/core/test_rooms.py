@@ -1,13 +1,15 @@
 """Which voxels lend their light to which, and how rooms are named."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_edt
 
 from gi_core.constants import VOXEL_OUTDOORS
 from gi_core.errors import InputError
-from gi_core.rooms import find_room, nearest, outdoor_blend, rooms_of, rooms_with_light
-from gi_core.world import Room
+from gi_core.rooms import find_room, light_shares, nearest, opening_nearness, outdoor_blend, rooms_of, rooms_with_light, weight_lattice
+from gi_core.world import Opening, Room
 
 ROOMS = (Room("hall", (0, 0, 0), (10, 4, 10)), Room("2", (8, 0, 8), (20, 4, 20)), Room("attic", (0, 4, 0), (10, 6, 10)))
 
@@ -85,3 +87,82 @@ def test_a_room_s_light_is_what_its_own_probes_give_alone(make_sector):
         assert found[place] == (room if rooms == {room} else 0)
     assert (found > 0).any()
     assert not rooms_with_light(make_sector(7, probes=0)).any()
+
+
+# Two rooms with 20 cm of wall between them at x = 10, a door in it, and a window of the first room in its wall at z = 0.
+DOOR, WINDOW = ((10.0, -2.1, 3.5), (10.2, 2.1, 4.5)), Opening((2.0, 0.9, 0.0), (4.0, 2.4, 0.0))
+HALL = Room("hall", (0, 0, 0), (10, 3, 8), (WINDOW, Opening(*DOOR, 2)))
+STUDY = Room("study", (10.2, 0, 0), (18, 3, 8), (Opening(*DOOR, 1),))
+PAIR = (HALL, STUDY)
+
+
+def mixed(position, surface=None) -> np.ndarray:
+    """Shares (n, 3) of the open air, the hall and the study."""
+    shares = light_shares(position, PAIR, surface)
+    assert (shares.share > 0).all()
+    found = np.stack([shares.of(number, len(position)) for number in range(3)], axis=1)
+    np.testing.assert_allclose(found.sum(axis=1), 1, atol=1e-6)
+    return found
+
+
+def test_through_a_door_each_room_gives_way_to_the_other_and_none_to_the_street():
+    x = np.arange(5.0, 15.2, 0.01)
+    way = np.stack([x, np.full(len(x), 1e-3), np.full(len(x), 4.0)], axis=1)
+    found = mixed(way)
+    assert not found[:, 0].any()
+    doorway = (x >= 10.0 + 1e-6) & (x <= 10.2 - 1e-6)
+    np.testing.assert_array_equal(found[doorway], np.tile([0, 0.5, 0.5], (doorway.sum(), 1)))
+    assert (np.diff(found[:, 1]) <= 1e-6).all()
+    # By MATH.md's bound, for a door 1 m wide and 4.2 m high with what lies below the floor.
+    assert np.abs(np.diff(found[:, 1])).max() < 0.01 * np.hypot(0.5, 2.1) / (0.5 * 2.1) / (0.75 * np.pi)
+    np.testing.assert_array_equal(found[[0, -1]], [[0, 1, 0], [0, 0, 1]])
+    mirrored = np.stack([20.2 - way[:, 0], way[:, 1], way[:, 2]], axis=1)
+    np.testing.assert_allclose(mixed(mirrored)[:, 2], found[:, 1], atol=1e-6)
+
+
+def test_walls_part_two_rooms_sharply_beside_their_door():
+    beside = np.array([[9.99, 1, 2], [10.21, 1, 2], [9.99, 1, 4.6], [10.21, 2.2, 4.0], [10.1, 1, 2], [5, 1, -0.5], [9.9, 1, -0.01]])
+    np.testing.assert_array_equal(mixed(beside).argmax(axis=1), [1, 2, 1, 2, 0, 0, 0])
+    assert mixed(beside).max(axis=1).tolist() == [1.0] * len(beside)
+    # A door's reveal is lit from both sides, though light is sampled off it: here in the wall beyond the door.
+    reveal = np.array([[10.1, 1, 3.52], [10.1, 2.08, 4.0]])
+    np.testing.assert_array_equal(mixed(reveal + np.array([[0, 0, 1.2], [0, -0.78, 0]]), reveal), [[0, 0.5, 0.5]] * 2)
+
+
+def test_a_window_and_a_door_have_each_their_share():
+    """Where both are in view, and beside the window, on the street."""
+    near = np.array([[3.0, 1.6, 0.5], [3.0, 1.6, -0.5], [9.5, 1.0, 4.0]])
+    found = mixed(near)
+    window, door = opening_nearness(HALL, near), opening_nearness(HALL, near, 2)
+    assert window.min() == door[:2].max() == 0
+    np.testing.assert_allclose(found[0], [window[0] / 2, 1 - window[0] / 2, 0], atol=1e-6)
+    np.testing.assert_allclose(found[1], [1 - window[1] / 2, window[1] / 2, 0], atol=1e-6)
+    np.testing.assert_allclose(found[2], [0, 1 - door[2] / 2, door[2] / 2], atol=1e-6)
+    corner = Room(
+        "hall", (0, 0, 0), (10, 3, 8), (Opening((8.5, 0.0, 0.0), (10.0, 3.0, 0.0)), Opening((10.0, 0.0, 0.0), (10.2, 3.0, 1.5), 2))
+    )
+    at = np.array([[9.4, 1.5, 0.6]])
+    open_air, study = opening_nearness(corner, at)[0], opening_nearness(corner, at, 2)[0]
+    assert min(open_air, study) > 0.1
+    shares = light_shares(at, (corner, STUDY))
+    assert [shares.of(number, 1)[0] for number in (0, 2)] == pytest.approx([open_air / 2, study / 2])
+    assert shares.of(1, 1)[0] == pytest.approx(1 - open_air / 2 - study / 2)
+
+
+def test_a_point_a_hair_behind_a_wall_is_the_rooms_that_it_is_seen_from():
+    """The ceiling met behind the edge of a wall: 0.4 mm in it. In the wall's middle it is not."""
+    assert mixed(np.array([[5.0, 2.0, -4e-4], [18.0004, 1, 4], [5, 2, -0.01]])).argmax(axis=1).tolist() == [1, 2, 0]
+
+
+def test_a_lattice_tells_of_the_doors_to_one_room():
+    door = Opening((10.0, -2.1, 3.5), (10.6, 2.1, 4.5), 2)  # through a wall that has a cell's centre in it
+    pair = (replace(HALL, openings=(WINDOW, door)), replace(STUDY, minimum=(10.6, 0, 0)))
+    both = weight_lattice(np.array([-2, -2, -2]), pair, (1,)), weight_lattice(np.array([-2, -2, -2]), pair, (1,), 2)
+    y, z, x = np.meshgrid(*(0.78125 * (np.arange(n) + 0.5) - 6.25 for n in (64, 128, 128)), indexing="ij")
+    at = np.stack([x, y, z], axis=-1)
+    for weight, to in zip(both, (0, 2), strict=True):
+        np.testing.assert_allclose(weight[1].reshape(-1), 255 * opening_nearness(pair[0], at.reshape(-1, 3), to), atol=0.5001)
+        assert weight[1].any()
+    between = ((at >= door.minimum) & (at <= door.maximum)).all(axis=-1)
+    assert between.any()
+    np.testing.assert_array_equal(both[1][0], np.where(between, 127, both[0][0]))

@@ -21,6 +21,7 @@ from bake_jobs.scene import Mesh, Scene, join_meshes
 from bake_jobs.sector_job import SectorBaker
 from bake_jobs.solids import boxes
 from gi_core import distant_file, sector_file
+from gi_core.constants import ROOM_CELL_M
 from gi_core.container import write_atomic
 from gi_core.dataset import DISTANT_FILE, VERSION, Dataset, SectorFacts, WorldInfo, fine_path, geometry_path, sector_path, write_world
 from gi_core.distant_transfer import DistantTransfer
@@ -89,6 +90,18 @@ def scene_v5() -> Scene:
     return replace(scene, rooms=(replace(scene.rooms[0], openings=(door,)), found))
 
 
+def scene_v6() -> Scene:
+    """The same with a door between two rooms, one of them drawn as a mesh and so in finer cells. Version 6."""
+    scene = scene_v5()
+    cell_m = ROOM_CELL_M / 4
+    air = np.ones((32, 32, 64), bool)
+    air[:, 16:, 32:] = False
+    door = Opening((50.0, 0.0, 43.0), (50.25, 2.0, 44.0), 2)
+    at = np.argwhere(air)[:, [2, 0, 1]] + [514, 0, 416]
+    vault = Room("vault", (50.25, 0.0, 40.625), (56.4, 3.1, 43.7), (replace(door, to=1),), pack_cells(at, cell_m))
+    return replace(scene, rooms=(replace(scene.rooms[0], openings=(*scene.rooms[0].openings, door)), vault))
+
+
 def write_golden(folder: Path, settings: BakeSettings = SETTINGS, scene: Scene | None = None) -> WorldInfo:
     """A whole dataset into a folder; of the tiny scene when no other is given."""
     scene = scene or tiny_scene()
@@ -148,7 +161,7 @@ def write_distant(target: Path) -> None:
 
 # Of the cube and of harmonics, whose sector files have other arrays.
 WRITTEN = {
-    f"v{VERSION}_sector{sector_file.VERSION}": (SETTINGS, scene_v5()),
+    f"v{VERSION}_sector{sector_file.VERSION}": (SETTINGS, scene_v6()),
     f"v2_sector{sector_file.VERSION}": (SETTINGS_V2, tiny_scene()),
 }
 

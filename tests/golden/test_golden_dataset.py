@@ -31,6 +31,7 @@ DIGESTS = {
     "v2_sector2": "d4e9deba8154c6fa0b66c46e0e8ecf95",
     "v4_sector2": "286608a0e21588e0ffdf44fac39a4619",
     "v5_sector2": "7d257cd69f93d960f01310a3f20049ae",
+    "v6_sector2": "a5c6d0a21eb7c1c67e19620b36f48df9",
 }
 # Sector files of version 1 in harmonics.
 REFUSED = "v2"
@@ -233,12 +234,12 @@ def test_the_golden_dataset_still_lights_a_street(golden):
 
 
 @pytest.mark.parametrize(
-    ("version", "like"), [(1, "v4_sector2"), (2, "v2_sector2"), (3, "v4_sector2"), (4, "v4_sector2"), (5, "v5_sector2")]
+    ("version", "like"), [(1, "v4_sector2"), (2, "v2_sector2"), (3, "v4_sector2"), (4, "v4_sector2"), (5, "v5_sector2"), (6, "v6_sector2")]
 )
 def test_a_dataset_made_today_is_described_by_format_md(tmp_path, version, like):
     make = neighbour("make_golden")
     settings = {2: make.SETTINGS_V2, 3: make.SETTINGS_V3}.get(version, make.SETTINGS)
-    scene = {4: make.scene_v4, 5: make.scene_v5}.get(version, make.tiny_scene)()
+    scene = {4: make.scene_v4, 5: make.scene_v5, 6: make.scene_v6}.get(version, make.tiny_scene)()
     world = make.write_golden(tmp_path, settings, scene)
     assert json.loads((tmp_path / "world.json").read_bytes())["version"] == version
     golden = HERE / like

@@ -10,6 +10,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+from PIL import Image
 
 from gi_core import distant_file
 from gi_core.constants import VOLUME_SHAPE, VOXEL_SIZE_M
@@ -17,6 +18,7 @@ from server.app import create_app
 from server.settings import Settings
 
 LIGHTS = {"": {}, "sky": {"light": "sky"}, "full": {"light": "full"}}
+FROM_ABOVE = {"eye": "0,120,0", "look": "60,0,60", "width": 64, "distant": "client"}
 
 
 def array(reply: httpx.Response) -> np.ndarray:
@@ -182,6 +184,21 @@ def test_distant_light_that_was_not_baked_is_refused(serving: Any, city: Path, t
         refused = client.get("/v1/distant", params={**moment, "light": "full"})
         assert refused.status_code == 400
         assert "bake it again" in refused.json()["detail"]
+        refused = client.get("/v1/preview.png", params={**moment, **FROM_ABOVE, "distant_light": "full"})
+        assert (refused.status_code, "bake it again" in refused.json()["detail"]) == (400, True)
+
+
+def test_a_picture_shows_the_distant_light_that_it_is_asked_for(http: httpx.Client, moment: dict[str, Any]) -> None:
+    """From 120 m up no ground lies in the eye's one volume: all of it reads the texture."""
+    pictures = {}
+    for light, asked in {"": {}, "sky": {"distant_light": "sky"}, "full": {"distant_light": "full"}}.items():
+        reply = http.get("/v1/preview.png", params={**moment, **FROM_ABOVE, **asked})
+        pictures[light] = np.asarray(Image.open(io.BytesIO(reply.content)).convert("L"), np.float64)
+    np.testing.assert_array_equal(pictures[""], pictures["full"])
+    assert (pictures["full"] >= pictures["sky"]).all()
+    assert (pictures["full"] > pictures["sky"]).mean() > 0.2
+    reply = http.get("/v1/preview.png", params={**moment, **FROM_ABOVE, "distant": "off", "distant_light": "sky"})
+    assert (reply.status_code, "distant_light with distant=on or client only" in reply.text) == (400, True)
 
 
 def test_probes_are_within_the_radius(http: httpx.Client, moment: dict[str, Any], place: dict[str, Any]) -> None:

@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 from gi_core.constants import ROOM_OUTDOORS, VOLUME_SHAPE, VOXEL_INDOORS, VOXEL_NO_SECTOR, VOXEL_OUTDOORS, VOXEL_SIZE_M, VOXEL_SOLID
+from gi_core.distant_file import DistantLight
 from gi_core.engine import Distant, LitProbes
 from gi_core.errors import OutsideWorldError
 from gi_core.grid import SectorIndex, volume_first_voxel, voxel_centre
@@ -73,7 +74,7 @@ class Engine:
         values = np.zeros((6, *VOLUME_SHAPE, 3), np.float32)
         return SimpleNamespace(values=values, mask=mask, origin=voxel_centre(first), voxel_size=np.full(3, VOXEL_SIZE_M))
 
-    def distant(self, _: Lighting) -> Distant:
+    def distant(self, _: Lighting, light: DistantLight | None = None) -> Distant:
         return Distant(np.zeros((1, 1, 6, 3), np.float32), SectorIndex(0, 0), np.ones((1, 1), np.uint8))
 
     def probes(self, *_: Any) -> LitProbes:

@@ -2,7 +2,10 @@
 
 import io
 import json
+import shutil
 import struct
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -11,9 +14,13 @@ import pytest
 from PIL import Image
 
 from gi_core.constants import VOLUME_SHAPE
+from gi_core.dataset import Dataset, write_world
+from gi_core.rooms import opening_nearness
 from gi_core.volume import Volume
-from gi_core.world import Room
+from gi_core.world import Opening, Room
+from server.app import create_app
 from server.routes.volume import volume_facts
+from server.settings import Settings
 
 Place = dict[str, Any]
 
@@ -293,6 +300,42 @@ def test_a_weight_is_sharp_at_walls_and_smooth_through_openings(http: httpx.Clie
     for wrong in ({"mask": 1}, {"format": "ktx2"}):
         assert "weight with kind=interior, format=npy or raw, and no mask" in refusal(http, inside, kind="interior", weight=1, **wrong)
     assert "weight with kind=interior" in refusal(http, inside, weight=1)
+
+
+def test_a_weight_to_another_room_is_of_the_doors_between_them(serving: Any, city: Path, tmp_path: Path, noon: Place) -> None:
+    """The tiny city with a door drawn from one of its rooms to another: its sectors know of none."""
+    joined = tmp_path / "joined"
+    shutil.copytree(city, joined)
+    world = Dataset.open(city).world
+    first, second, *others = world.rooms
+    middle = (np.array(first.minimum) + first.maximum) / 2
+    low, high = (first.maximum[0], middle[1] - 1, middle[2] - 1), (first.maximum[0] + 0.25, middle[1] + 1, middle[2] + 1)
+    rooms = (
+        replace(first, openings=(*first.openings, Opening(low, high, 2))),
+        replace(second, openings=(*second.openings, Opening(low, high, 1))),
+        *others,
+    )
+    write_world(joined, replace(world, rooms=rooms))
+    inside = {**noon, **dict(zip("xyz", middle.tolist(), strict=True)), "kind": "interior", "weight": 1, "room": first.name}
+    with serving(create_app(joined, Settings())) as client:
+        told = client.get("/v1/world").json()["rooms"]
+        assert told[0]["doors"] == [{"minimum": list(low), "maximum": list(high), "to": 2}]
+        assert [len(told[0]["openings"]), told[1]["doors"][0]["to"]] == [len(first.openings), 1]
+        to_the_street, to_the_room = (array(get(client, inside, **more)[0]) for more in ({}, {"to": second.name}))
+        facts = get(client, inside, to="2")[1]
+        grid = np.meshgrid(*(np.arange(n) for n in to_the_room.shape[1:]), indexing="ij")
+        at = np.stack([grid[axis] for axis in (2, 0, 1)], axis=-1) * facts["voxel_size"] + facts["origin"]
+        near = opening_nearness(rooms[0], at.reshape(-1, 3), 2).reshape(at.shape[:-1])
+        np.testing.assert_allclose(to_the_room[1], 255 * near, atol=0.51)
+        assert to_the_room[1].any()
+        # What is asked for without `to` is what it was before there were doors.
+        with serving(create_app(city, Settings())) as before:
+            np.testing.assert_array_equal(to_the_street, array(get(before, inside)[0]))
+        assert f"to: expected a room behind a door ({second.name!r})" in refusal(client, inside, to=first.name)
+        assert "expected one of" in refusal(client, inside, to="nowhere")
+        for wrong in ({"weight": 0}, {"room": None}):
+            query = {name: value for name, value in (inside | wrong).items() if value is not None}
+            assert "to with weight=1 and room only" in refusal(client, query, to="2")
 
 
 def test_a_header_stays_small_whatever_the_world_has() -> None:
