@@ -17,6 +17,7 @@ import numpy as np
 from bake_jobs.air import Air, beside_border, border_blocks
 from bake_jobs.choose import GAIN_STEP, Chooser, Pairs, neighbour_pairs
 from bake_jobs.config import BakeSettings
+from bake_jobs.distinct import distinct
 from bake_jobs.inside import Solids
 from bake_jobs.placement import OFF_EDGES_M, Placement, asked_positions, in_boxes
 from bake_jobs.rays import RayScene
@@ -201,9 +202,9 @@ def _mutually_visible(ray_scene: RayScene, air: Air, voxel: Int64, probe: Int64)
     seen = air.room[voxel] == air.room[probe]
     # Both ways are one ray.
     low, high = np.minimum(voxel, probe), np.maximum(voxel, probe)
-    unique, of_pair = np.unique(low * len(air.lattice) + high, return_inverse=True)
-    a, b = np.divmod(unique, len(air.lattice))
+    both, of_pair = distinct(low * len(air.lattice) + high)
+    a, b = np.divmod(both, len(air.lattice))
     offset = air.centre[b] - air.centre[a]
     distance = np.linalg.norm(offset, axis=1)
     open_ = ~ray_scene.occluded(air.centre[a], offset / np.maximum(distance, 1e-6)[:, None], distance)
-    return seen & (open_ | (a == b))[of_pair.reshape(-1)]
+    return seen & (open_ | (a == b))[of_pair]
