@@ -66,7 +66,7 @@ class ResidentSector:
         self.factor_starts = device.upload(sector.factor_starts)
         self.factor_source = device.upload(sector.factor_source)
         self.sky_starts = device.upload(sector.sky_starts)
-        self.factor_code = device.upload(padded(factor_weights.device_code(sector.factor_codes)))
+        self.factor_code = _factor_code(device, sector)
         self.factor_scale = device.upload(padded(factor_weights.device_scale(sector.factor_codes)))
         self.voxel_probe, self.voxel_weight = (device.upload(values) for values in outdoor_blend(sector))
         self.cubes = device.allocate(sector.probe_count * sector.basis_size * 16)
@@ -299,6 +299,21 @@ def _brick_emission(sector: Sector) -> Float32:
     assert sector.surfel_emission is not None
     means = relight_twin.brick_means(sector, sector.surfel_emission)
     return np.pad(np.float32(np.pi) * means, ((0, 0), (0, 1)))
+
+
+def _factor_code(device: Device, sector: Sector) -> cl.Buffer:
+    """(F, B) codes as gather_probes.cl reads them, and behind them VECTOR zeros. Of harmonics they are worked out on the device: there
+    are twice as many as files have, and NumPy took half of the time that a sector took to get there."""
+    basis, factors = sector.basis_size, sector.factor_count
+    if basis == BASIS_SIZES["cube"]:
+        return device.upload(padded(sector.factor_code))
+    found = cl.Buffer(device.context, cl.mem_flags.READ_WRITE, factors * basis + VECTOR)
+    cl.enqueue_fill_buffer(device.queue, found, np.uint8(0), factors * basis, VECTOR)
+    if factors:
+        kernel = device.shared_kernel("expand_factors", BASIS_SIZE=basis, FACE_STEPS=factor_weights.FACE_STEPS)
+        roots = device.upload_once(factor_weights.device_roots)
+        kernel.launch_1d(factors, np.uint32(factors), device.upload(sector.factor_code), roots, found)
+    return found
 
 
 def padded(values: AnyArray) -> AnyArray:
