@@ -150,8 +150,7 @@ def _choose(
         shared[block] = True
         border += _choose_within(features, importance, pairs, may, block, worth * sharers**SHARED_PRICE)
     own = Chooser(_fewer_dimensions(features), importance * air.own, pairs, may & air.own & ~shared)
-    for number in border:
-        own.take(number)
+    own.take(*border)
     most = max(0, settings.probe_budget - len(border))
     own.take_best(worth, most)
     enough = len(own.chosen)
@@ -162,11 +161,7 @@ def _choose(
 
 def _choose_within(features: Float32, importance: Float64, pairs: Pairs, may: Bool, block: Int64, worth: float) -> list[int]:
     """A block's probes, from its own voxels alone."""
-    number = np.full(len(features), -1)
-    number[block] = np.arange(len(block))
-    voxel, probe = number[pairs.voxel], number[pairs.probe]
-    within = (voxel >= 0) & (probe >= 0)
-    chooser = Chooser(features[block], importance[block], Pairs.of(voxel[within], probe[within], len(block)), may[block])
+    chooser = Chooser(features[block], importance[block], pairs.within(block), may[block])
     chooser.take_best(worth, MAX_PROBES_PER_SECTOR)
     return [int(block[n]) for n in chooser.chosen]
 

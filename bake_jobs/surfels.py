@@ -150,12 +150,12 @@ def cluster(gbuffer: GBuffer, room: UInt16, origin: Float64, albedo: Float32, em
 
 def _key(cell: Int64, room: Int64, direction: UInt8, level: Int64) -> Int64:
     """Sort keys (n,) of surfel cells (n, 3) at their level's size; the module's docstring draws the bits."""
+    x, y, z = np.ascontiguousarray(cell.T)
     # Shifted rather than divided, which takes four times as long.
-    brick = cell >> _CELL_SHIFT
-    within = cell - (brick << _CELL_SHIFT)
-    b = brick + np.array([_HALF_RANGE, _HALF_HEIGHT, _HALF_RANGE])
-    key = ((level << 13 | b[:, 1]) << 16 | b[:, 2]) << 16 | b[:, 0]
-    return ((key << 6 | room) << 3 | direction) << _BRICK_SHIFT | (within[:, 1] << 4 | within[:, 2] << 2 | within[:, 0])
+    key = (level << 13 | (y >> _CELL_SHIFT) + _HALF_HEIGHT) << 16 | (z >> _CELL_SHIFT) + _HALF_RANGE
+    key = key << 16 | (x >> _CELL_SHIFT) + _HALF_RANGE
+    within = CELLS_PER_BRICK - 1
+    return ((key << 6 | room) << 3 | direction) << _BRICK_SHIFT | ((y & within) << 4 | (z & within) << 2 | (x & within))
 
 
 def feedback(surfels: Surfels, gbuffer: GBuffer, k: int) -> tuple[UInt16, Float32]:

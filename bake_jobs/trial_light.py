@@ -125,7 +125,7 @@ class TrialScene:
         directions = self.states.sun_direction.astype(np.float32)
         cosine = np.maximum(normal @ directions.T, 0)
         # Sun by sun: rays that run side by side are a sixth faster.
-        sun, cell = np.nonzero(cosine.T)
+        sun, cell = np.nonzero(np.ascontiguousarray((cosine > 0).T))
         blocked = self._rays.occluded(start[cell], directions[sun])
         cosine[cell[blocked], sun[blocked]] = 0
         return cosine
