@@ -225,7 +225,8 @@ def _codes(found: Container, probe_position: AnyArray, centres: Callable[[], Flo
     for row, column in zip(expected, difference.T, strict=True):
         row += column  # wraps
     trim = np.ascontiguousarray(np.moveaxis(found.take("factor_trim", "i1", 3), 2, 0))
-    return Codes(container.interleaved(np.concatenate([weight, expected])), scale, trim)
+    # As four rows in memory: so they are checked, and so a device takes them.
+    return Codes(np.concatenate([weight, expected]).T, scale, trim)
 
 
 def _words(octets: AnyArray) -> AnyArray:

@@ -7,7 +7,7 @@
 // the cube of all. Its signed roots of 127 have 128 added, since PoCL turns signed bytes into other numbers one by one; so all of this
 // stays above 0, and is whole numbers. There are no ties: 127 is a prime above all factors of the product but 127 itself.
 //
-// One work-item per factor. Defines: BASIS_SIZE, coefficients per channel: 4 or 9; FACE_STEPS.
+// All first codes come before all of y, these before those of z and of x. One work-item per factor. Defines: BASIS_SIZE, coefficients per channel: 4 or 9; FACE_STEPS.
 #ifndef BASIS_SIZE
 #error "BASIS_SIZE is not defined"
 #endif
@@ -18,16 +18,16 @@
 
 __kernel void expand_factors(
     const uint factors,
-    __global const char4 *factor,
+    __global const char *factor,
     __global const uchar8 *root_of_direction,
     __global uchar *factor_code)
 {
     const uint f = get_global_id(0);
     if (f >= factors)
         return;
-    const char4 own = factor[f];
-    const uint first = own.x;
-    const uint direction = ((own.y + FACE_STEPS) * EDGE + own.z + FACE_STEPS) * EDGE + own.w + FACE_STEPS;
+    const uint first = factor[f];
+    const int y = factor[factors + f], z = factor[2 * factors + f], x = factor[3 * factors + f];
+    const uint direction = ((y + FACE_STEPS) * EDGE + z + FACE_STEPS) * EDGE + x + FACE_STEPS;
     // 127 * 128 for the result's 128, 63 to round, and what the roots have too much.
     const uint8 code = (convert_uint8(root_of_direction[direction]) * first + (127 * 128 + 63 - 128 * first)) / 127;
     __global uchar *to = factor_code + f * BASIS_SIZE;
