@@ -17,6 +17,7 @@ import numpy as np
 from bake_jobs.air import Air, beside_border, border_blocks
 from bake_jobs.choose import GAIN_STEP, Chooser, Pairs, neighbour_pairs
 from bake_jobs.config import BakeSettings
+from bake_jobs.distinct import distinct
 from bake_jobs.inside import Solids
 from bake_jobs.placement import OFF_EDGES_M, Placement, asked_positions, in_boxes
 from bake_jobs.rays import RayScene
@@ -149,8 +150,7 @@ def _choose(
         shared[block] = True
         border += _choose_within(features, importance, pairs, may, block, worth * sharers**SHARED_PRICE)
     own = Chooser(_fewer_dimensions(features), importance * air.own, pairs, may & air.own & ~shared)
-    for number in border:
-        own.take(number)
+    own.take(*border)
     most = max(0, settings.probe_budget - len(border))
     own.take_best(worth, most)
     enough = len(own.chosen)
@@ -161,11 +161,7 @@ def _choose(
 
 def _choose_within(features: Float32, importance: Float64, pairs: Pairs, may: Bool, block: Int64, worth: float) -> list[int]:
     """A block's probes, from its own voxels alone."""
-    number = np.full(len(features), -1)
-    number[block] = np.arange(len(block))
-    voxel, probe = number[pairs.voxel], number[pairs.probe]
-    within = (voxel >= 0) & (probe >= 0)
-    chooser = Chooser(features[block], importance[block], Pairs.of(voxel[within], probe[within], len(block)), may[block])
+    chooser = Chooser(features[block], importance[block], pairs.within(block), may[block])
     chooser.take_best(worth, MAX_PROBES_PER_SECTOR)
     return [int(block[n]) for n in chooser.chosen]
 
@@ -201,9 +197,9 @@ def _mutually_visible(ray_scene: RayScene, air: Air, voxel: Int64, probe: Int64)
     seen = air.room[voxel] == air.room[probe]
     # Both ways are one ray.
     low, high = np.minimum(voxel, probe), np.maximum(voxel, probe)
-    unique, of_pair = np.unique(low * len(air.lattice) + high, return_inverse=True)
-    a, b = np.divmod(unique, len(air.lattice))
+    both, of_pair = distinct(low * len(air.lattice) + high)
+    a, b = np.divmod(both, len(air.lattice))
     offset = air.centre[b] - air.centre[a]
     distance = np.linalg.norm(offset, axis=1)
     open_ = ~ray_scene.occluded(air.centre[a], offset / np.maximum(distance, 1e-6)[:, None], distance)
-    return seen & (open_ | (a == b))[of_pair.reshape(-1)]
+    return seen & (open_ | (a == b))[of_pair]

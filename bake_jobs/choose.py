@@ -40,6 +40,21 @@ class Pairs:
     by_probe: Int64
     probe_starts: Int64
 
+    def within(self, voxels: Int64) -> "Pairs":
+        """The pairs of some voxels (k,), ascending, with one another: voxel and candidate numbers are places in ``voxels``."""
+        place = np.full(len(self.starts) - 1, -1)
+        place[voxels] = np.arange(len(voxels))
+        at, of_voxel = self.of_voxels(voxels)
+        probe = place[self.probe[at]]
+        return Pairs.of(of_voxel[probe >= 0], probe[probe >= 0], len(voxels))
+
+    def of_voxels(self, voxels: Int64) -> tuple[Int64, Int64]:
+        """Numbers (m,) of the pairs of some voxels (k,), and of each which of the k it is of."""
+        number = self.starts[voxels + 1] - self.starts[voxels]
+        first = np.cumsum(number) - number
+        at = np.arange(int(number.sum())) + np.repeat(self.starts[voxels] - first, number)
+        return at, np.repeat(np.arange(len(voxels)), number)
+
     @classmethod
     def of(cls, voxel: Int64, probe: Int64, count: int) -> "Pairs":
         """From unsorted pairs (m,) over ``count`` voxels."""
@@ -99,8 +114,14 @@ class Chooser:
         off = self._light - self._explained
         return np.where(self._covered, np.einsum("nd,nd->n", off, off), UNLIT)
 
-    def take(self, probe: int) -> None:
-        """Choose a voxel."""
+    def take(self, *probes: int) -> None:
+        """Choose voxels, one after the other."""
+        touched = [self._blend_in(probe) for probe in probes]
+        if touched:
+            self._refresh(touched[0] if len(touched) == 1 else np.unique(np.concatenate(touched)))
+
+    def _blend_in(self, probe: int) -> Int64:
+        """Explain voxels by one probe more; which (t,). What others would gain there is to be worked out anew."""
         self.chosen.append(probe)
         self._may[probe] = False
         pairs = self._pairs
@@ -108,7 +129,7 @@ class Chooser:
         step, share = self._steps(touched, np.full(len(touched), probe))
         self._explained[touched] += share[:, None] * step
         self._covered[touched] = True
-        self._refresh(touched)
+        return touched
 
     def take_best(self, worth: float, most: int) -> None:
         """Choose until no probe gains as much as ``worth``, or ``most`` more are chosen."""
@@ -130,12 +151,8 @@ class Chooser:
 
     def _refresh(self, voxels: Int64) -> None:
         """Work out anew what every probe would gain at these voxels."""
-        pairs = self._pairs
-        number = pairs.starts[voxels + 1] - pairs.starts[voxels]
-        first = np.cumsum(number) - number
-        at = np.arange(int(number.sum())) + np.repeat(pairs.starts[voxels] - first, number)
-        of_voxel = np.repeat(np.arange(len(voxels)), number)
-        probe = pairs.probe[at]
+        at, of_voxel = self._pairs.of_voxels(voxels)
+        probe = self._pairs.probe[at]
         explained, covered = self._explained[voxels], self._covered[voxels]
         off = self._light[voxels] - explained
         # |off - t step|^2 at the best t, from scalar products. take: three times as fast as indexing, and this is where the time goes.

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bake_jobs.distinct import distinct
 from bake_jobs.gbuffer import GBuffer, RayPattern
 from bake_jobs.surfels import Surfels
 from gi_core.arrays import Float32, Float64, Int64, UInt32
@@ -41,8 +42,7 @@ def gather(gbuffer: GBuffer, pattern: RayPattern, surfels: Surfels, sky_patches:
     """
     bricks, size = len(surfels.brick_cell), pattern.weight.shape[1]
     probe, ray = np.divmod(surfels.hit, gbuffer.rays)
-    pair, inverse = np.unique(probe * bricks + surfels.brick_of_surfel[surfels.of_hit], return_inverse=True)
-    inverse = inverse.reshape(-1)
+    pair, inverse = distinct(probe * bricks + surfels.brick_of_surfel[surfels.of_hit])
     brick_weight = np.stack([np.bincount(inverse, pattern.weight[ray, b], len(pair)) for b in range(size)], axis=1)
     pair_probe, pair_brick = np.divmod(pair, max(bricks, 1))
 

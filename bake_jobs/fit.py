@@ -41,14 +41,19 @@ def _descend(gram: Float64, right: Float64, start: Float64, allowed: Bool) -> Fl
     """Minimise w . gram w / 2 - right . w over the simplex of the allowed, from a start (n, c) that is scaled to be on it."""
     weight = start / start.sum(axis=1, keepdims=True)
     slope = np.matmul(gram, weight[:, :, None])[:, :, 0] - right
-    row = np.arange(len(weight))
+    # Flat, since ``take`` from rows is twice as fast as two indices, and views, so that what is written to one is in both.
+    rows, weight_flat, slope_flat = gram.reshape(-1, gram.shape[1]), weight.reshape(-1), slope.reshape(-1)
+    first = np.arange(len(weight)) * gram.shape[1]
+    barred = np.where(allowed, 0, np.inf)
     for _ in range(STEPS):
-        to = np.argmin(np.where(allowed, slope, np.inf), axis=1)
-        source = np.argmax(np.where(weight > 0, slope, -np.inf), axis=1)
-        difference = gram[row, to] - gram[row, source]
-        curvature = np.maximum(difference[row, to] - difference[row, source], 1e-12)
-        step = np.clip((slope[row, source] - slope[row, to]) / curvature, 0, weight[row, source])
-        weight[row, to] += step
-        weight[row, source] -= step
-        slope += step[:, None] * difference
+        to = first + np.argmin(slope + barred, axis=1)
+        source = first + np.argmax(np.where(weight > 0, slope, -np.inf), axis=1)
+        difference = rows.take(to, axis=0)
+        difference -= rows.take(source, axis=0)
+        curvature = np.maximum(difference.reshape(-1).take(to) - difference.reshape(-1).take(source), 1e-12)
+        step = np.clip((slope_flat.take(source) - slope_flat.take(to)) / curvature, 0, weight_flat.take(source))
+        weight_flat[to] += step
+        weight_flat[source] -= step
+        difference *= step[:, None]
+        slope += difference
     return weight

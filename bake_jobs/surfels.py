@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bake_jobs.distinct import distinct
 from bake_jobs.gbuffer import GBuffer
 from gi_core.arrays import Float32, Float64, Int32, Int64, UInt8, UInt16
 from gi_core.constants import BRICK_CELL_M, MAX_BRICK_LEVEL, ROOM_OUTDOORS, SURFEL_CELL_M
@@ -36,6 +37,7 @@ FEEDBACK_STEPS = 15
 _HALF_RANGE = 1 << 15
 _HALF_HEIGHT = 1 << 12
 _ROOM_KEYS = 63  # rooms beyond share keys; two that share one share light only where one brick reaches into both
+_CELL_SHIFT = CELLS_PER_BRICK.bit_length() - 1
 _BRICK_SHIFT = 6  # of a surfel's key: what is left names its brick
 
 
@@ -110,16 +112,15 @@ def cluster(gbuffer: GBuffer, room: UInt16, origin: Float64, albedo: Float32, em
             raise SourceError(
                 f"a probe sees a surface more than {half * BRICK_CELL_M:.0f} m away along {'xyz'[axis]}; split the world into parts"
             )
-    fine_key, fine_of_hit = np.unique(_key(cell, room_key, direction, np.zeros(len(cell), np.int64)), return_inverse=True)
-    fine_of_hit = fine_of_hit.reshape(-1)
+    fine_key, fine_of_hit = distinct(_key(cell, room_key, direction, np.zeros(len(cell), np.int64)))
     closest = np.full(len(fine_key), np.inf, np.float32)
     np.minimum.at(closest, fine_of_hit, gbuffer.hits.distance[hit])
     level = np.clip(np.floor(np.log2(np.maximum(closest, 1e-6) / double_beyond_m)) + 1, 0, MAX_BRICK_LEVEL).astype(np.int64)
     of_fine_cell = np.empty(len(fine_key), np.int64)
     of_fine_cell[fine_of_hit] = np.arange(len(hit))  # any hit of a fine cell knows its place and direction
     coarse_cell = cell[of_fine_cell] >> level[:, None]
-    surfel_key, surfel_of_fine = np.unique(_key(coarse_cell, room_key[of_fine_cell], direction[of_fine_cell], level), return_inverse=True)
-    of_hit = surfel_of_fine.reshape(-1)[fine_of_hit]
+    surfel_key, surfel_of_fine = distinct(_key(coarse_cell, room_key[of_fine_cell], direction[of_fine_cell], level))
+    of_hit = surfel_of_fine[fine_of_hit]
     count = len(surfel_key)
     hits_of_surfel = np.bincount(of_hit, minlength=count)
 
@@ -149,11 +150,12 @@ def cluster(gbuffer: GBuffer, room: UInt16, origin: Float64, albedo: Float32, em
 
 def _key(cell: Int64, room: Int64, direction: UInt8, level: Int64) -> Int64:
     """Sort keys (n,) of surfel cells (n, 3) at their level's size; the module's docstring draws the bits."""
-    brick = cell // CELLS_PER_BRICK
-    within = cell - brick * CELLS_PER_BRICK
-    b = brick + np.array([_HALF_RANGE, _HALF_HEIGHT, _HALF_RANGE])
-    key = ((level << 13 | b[:, 1]) << 16 | b[:, 2]) << 16 | b[:, 0]
-    return ((key << 6 | room) << 3 | direction) << _BRICK_SHIFT | (within[:, 1] << 4 | within[:, 2] << 2 | within[:, 0])
+    x, y, z = np.ascontiguousarray(cell.T)
+    # Shifted rather than divided, which takes four times as long.
+    key = (level << 13 | (y >> _CELL_SHIFT) + _HALF_HEIGHT) << 16 | (z >> _CELL_SHIFT) + _HALF_RANGE
+    key = key << 16 | (x >> _CELL_SHIFT) + _HALF_RANGE
+    within = CELLS_PER_BRICK - 1
+    return ((key << 6 | room) << 3 | direction) << _BRICK_SHIFT | ((y & within) << 4 | (z & within) << 2 | (x & within))
 
 
 def feedback(surfels: Surfels, gbuffer: GBuffer, k: int) -> tuple[UInt16, Float32]:

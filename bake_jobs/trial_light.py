@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bake_jobs.distinct import distinct
 from bake_jobs.gbuffer import cube_map_pattern
 from bake_jobs.rays import SURFACE_OFFSET_M, Hits, RayScene
 from bake_jobs.surfels import KEY_OFFSET_M, principal_direction
@@ -66,8 +67,8 @@ class TrialScene:
     def light(self, points: Float64) -> TrialLight:
         """Light at points (n, 3) [m], world frame."""
         keys, clearance = self._look(points)
-        unique, of_ray = np.unique(keys, return_inverse=True)
-        return TrialLight(self._gather(of_ray.reshape(keys.shape), keys < 0, self._exitance(unique)), clearance)
+        cells, of_ray = distinct(keys.reshape(-1))
+        return TrialLight(self._gather(of_ray.reshape(keys.shape), keys < 0, self._exitance(cells)), clearance)
 
     def _look(self, points: Float64) -> tuple[Int64, Float32]:
         """Cell keys (n, r) of what each point's rays meet, -1 for the sky; and the distance (n,) of the nearest hit."""
@@ -77,14 +78,15 @@ class TrialScene:
         anchor = self._rays.anchor
         for start in range(0, len(points), POINTS_AT_ONCE):
             some = points[start : start + POINTS_AT_ONCE]
-            hits = self._rays.closest(np.repeat(some, len(direction), axis=0), np.tile(direction, (len(some), 1)))
-            distance = hits.distance.reshape(len(some), -1)
-            clearance[start : start + len(some)] = distance.min(axis=1)
+            # Direction by direction: rays that run side by side are a sixth faster.
+            hits = self._rays.closest(np.tile(some, (len(direction), 1)), np.repeat(direction, len(some), axis=0))
+            distance = hits.distance.reshape(-1, len(some))
+            clearance[start : start + len(some)] = distance.min(axis=0)
             # A ray into a corner may end a rounding beyond the edge, in the next cell: keys are taken a little before the end.
             reach = np.where(np.isfinite(distance), distance - np.float32(KEY_OFFSET_M), 0)[:, :, None]
-            at = (some - anchor).astype(np.float32)[:, None] + direction * reach
+            at = (some - anchor).astype(np.float32) + direction[:, None] * reach
             key = _cell_keys(at.reshape(-1, 3), hits, distance.reshape(-1))
-            keys[start : start + len(some)] = key.reshape(len(some), -1)
+            keys[start : start + len(some)] = key.reshape(-1, len(some)).T
         return keys, clearance
 
     def _exitance(self, keys: Int64) -> Float32:
@@ -122,7 +124,8 @@ class TrialScene:
         """(k, suns): cosine to each sun where it is seen, otherwise 0."""
         directions = self.states.sun_direction.astype(np.float32)
         cosine = np.maximum(normal @ directions.T, 0)
-        cell, sun = np.nonzero(cosine)
+        # Sun by sun: rays that run side by side are a sixth faster.
+        sun, cell = np.nonzero(np.ascontiguousarray((cosine > 0).T))
         blocked = self._rays.occluded(start[cell], directions[sun])
         cosine[cell[blocked], sun[blocked]] = 0
         return cosine
@@ -133,8 +136,9 @@ class TrialScene:
         directions = _turned(self._bounce, normal).reshape(-1, 3)
         origins = np.repeat(start, rays, axis=0)
         hits = self._rays.closest(origins, directions)
-        sky = np.where(hits.hit[:, None], 0, states.sky_radiance(directions)).reshape(len(start), rays, states.count).sum(axis=1)
-        sky *= np.float32(np.pi / rays)
+        of_sky = np.zeros((len(start) * rays, states.count), np.float32)
+        of_sky[~hits.hit] = states.sky_radiance(directions[~hits.hit])
+        sky = of_sky.reshape(len(start), rays, states.count).sum(axis=1) * np.float32(np.pi / rays)
         openness = 1 - hits.hit.reshape(len(start), rays).mean(axis=1, dtype=np.float32)
         met = np.flatnonzero(hits.hit)
         at = origins[met] + directions[met] * (hits.distance[met, None] - SURFACE_OFFSET_M)

@@ -68,11 +68,14 @@ def basis_of_size(size: int) -> str:
 
 def harmonics(directions: AnyArray, size: int = 9) -> AnyArray:
     """Real spherical harmonics at unit directions: (n, 3) -> (n, size), of the input's dtype."""
-    x, y, z = directions[:, 0], directions[:, 1], directions[:, 2]
+    x, y, z = np.ascontiguousarray(directions.T)
     polynomials = [np.ones_like(x), y, z, x]
     if size > 4:
         polynomials += [x * y, y * z, 3 * z * z - 1, x * z, x * x - y * y]
-    return np.stack(polynomials, axis=1) * SH_NORM[:size].astype(directions.dtype)
+    found = np.empty((len(directions), size), directions.dtype)
+    for b, norm in enumerate(SH_NORM[:size].astype(directions.dtype)):
+        np.multiply(polynomials[b], norm, out=found[:, b])
+    return found
 
 
 def projection_weights(basis: str, directions: AnyArray) -> AnyArray:

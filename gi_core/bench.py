@@ -133,11 +133,11 @@ def daylight() -> RelightInput:
     return RelightInput(np.full((SKY_PATCHES, 3), (1.2e4, 1.4e4, 1.8e4), np.float32), sun)
 
 
-def bench_decode(device: Device, rounds: int = 30) -> Measurement:
+def bench_decode(device: Device, sector: Sector, name: str, rounds: int) -> Measurement:
     """From a sector's file in memory to its buffers on the device. Baseline: decompressing the same bytes and no more."""
     import zstandard
 
-    data = sector_file.encode(talk_size_sector(0), {}, SKY_PATCHES)
+    data = sector_file.encode(sector, {}, SKY_PATCHES)
 
     def decode() -> None:
         ResidentSector(device, sector_file.decode(data, "bench")[0], SKY_PATCHES)
@@ -146,9 +146,8 @@ def bench_decode(device: Device, rounds: int = 30) -> Measurement:
     payload = data[data.index(b"\x28\xb5\x2f\xfd") :]
     alone = zstandard.ZstdDecompressor()
     milliseconds, baseline = (1e3 * s for s in side_by_side(decode, lambda: alone.decompress(payload), rounds))
-    return Measurement(
-        "sector_decode", milliseconds, "ms", baseline, baseline / milliseconds, {"bytes": len(data)}, device.name, "zstd alone"
-    )
+    sizes = {"bytes": len(data), "factors": sector.factor_count}
+    return Measurement(name, milliseconds, "ms", baseline, baseline / milliseconds, sizes, device.name, "zstd alone")
 
 
 def run(device_name: str | None = None, quick: bool = False) -> list[Measurement]:
@@ -159,5 +158,7 @@ def run(device_name: str | None = None, quick: bool = False) -> list[Measurement
     device = shared_device(device_name)
     relight = bench_relight.run(device, quick)
     volumes = [bench(device, 10 if quick else 100) for bench in (bench_volume.bench_fill, bench_volume.bench_step)]
-    rows = [*relight, *volumes, bench_decode(device, 3 if quick else 30), *bench_lamps(device, quick)]
+    made_up = {"sector_decode": talk_size_sector(0), "sector_decode_sh2": bench_basis.sector_in("sh2", 0)}
+    decodes = [bench_decode(device, sector, name, 3 if quick else 30) for name, sector in made_up.items()]
+    rows = [*relight, *volumes, *decodes, *bench_lamps(device, quick)]
     return rows if quick else [*rows, *bench_basis.run(device), *bench_roofline.run(device.name)]

@@ -171,7 +171,7 @@ def _pack(values: AnyArray, delta: bool) -> bytes:
     return np.ascontiguousarray(octets.T).tobytes()
 
 
-def _unpack(raw: bytes, dtype: "np.dtype[Any]", shape: tuple[int, ...], delta: bool) -> AnyArray:
+def _unpack(raw: memoryview, dtype: "np.dtype[Any]", shape: tuple[int, ...], delta: bool) -> AnyArray:
     values: AnyArray = interleaved(np.frombuffer(raw, np.uint8).reshape(dtype.itemsize, -1)).reshape(-1).view(dtype).reshape(shape)
     if delta and values.size:
         values = np.cumsum(values, axis=-1, dtype=dtype)
@@ -197,7 +197,7 @@ def _read_arrays(table: list[dict[str, Any]], raw: bytes, raw_bytes: int, where:
             raise CorruptFileError(f"{where}: array {name!r} has shape {shape!r}")
         if offset + size > raw_bytes:
             raise CorruptFileError(f"{where}: array {name!r} ends beyond the data")
-        arrays[name] = _unpack(raw[offset : offset + size], dtype, tuple(shape), delta)
+        arrays[name] = _unpack(memoryview(raw)[offset : offset + size], dtype, tuple(shape), delta)
         offset += size
     if offset != raw_bytes:
         raise CorruptFileError(f"{where}: {raw_bytes - offset} bytes belong to no array")

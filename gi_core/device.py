@@ -3,6 +3,7 @@
 import os
 import threading
 import warnings
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
 
@@ -128,6 +129,7 @@ class Device:
         self.launched: list[tuple[str, cl.Event]] | None = [] if timed else None
         self._programs: dict[tuple[str, tuple[tuple[str, int], ...]], cl.Program] = {}
         self._shared_kernels: dict[tuple[object, ...], SharedKernel] = {}
+        self._tables: dict[Callable[[], np.ndarray[Any, Any]], cl.Buffer] = {}
         try:
             self._check_layout()
         except KernelBuildError as error:
@@ -178,6 +180,13 @@ class Device:
         if data.nbytes == 0:
             data = np.zeros(16, np.uint8)
         return cl.Buffer(self.context, cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR, hostbuf=data)
+
+    def upload_once(self, table: Callable[[], "np.ndarray[Any, Any]"]) -> cl.Buffer:
+        """The buffer of what a function gives, which is the same each time: uploaded at the first call, then kept."""
+        found = self._tables.get(table)
+        if found is None:
+            found = self._tables[table] = self.upload(table())
+        return found
 
     def allocate(self, nbytes: int) -> cl.Buffer:
         """A read-write buffer of zeros."""

@@ -39,14 +39,19 @@ def expected_directions(
     sky = (_SKY_DISTANCE * patch_centres(sky_patches)).T
     places: Float32 = np.concatenate([centres, sky], axis=1).astype(np.float32)
     per_probe = counts(factor_starts)
-    offsets = [places[k][factor_source] - np.repeat(probe_position[k].astype(np.float32), per_probe) for k in _AXES]
+    source = factor_source.astype(np.int64)  # what ``take`` would make of it for each axis
+    offsets = [places[k].take(source) for k in _AXES]
+    for k, offset in zip(_AXES, offsets, strict=True):
+        offset -= np.repeat(probe_position[k].astype(np.float32), per_probe)
     y, z, x = offsets
     squared = x * x
     squared += y * y
     squared += z * z
-    per_length = np.float32(DIRECTION_STEPS) / np.sqrt(np.maximum(squared, np.float32(1)))
+    np.maximum(squared, np.float32(1), out=squared)
+    np.sqrt(squared, out=squared)
+    per_length = np.divide(np.float32(DIRECTION_STEPS), squared, out=squared)
     found = np.empty((3, len(factor_source)), np.int8)
     for row, offset in zip(found, offsets, strict=True):
         offset *= per_length
-        row[:] = np.rint(offset)
+        row[:] = np.rint(offset, out=offset)
     return found

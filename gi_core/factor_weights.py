@@ -82,13 +82,6 @@ def decode(codes: Codes, factor_starts: AnyArray, sky_starts: AnyArray) -> Float
     return np.asarray(shares / factor_shares(basis_of_size(basis)).astype(np.float32), np.float32)
 
 
-def device_code(codes: Codes) -> UInt8:
-    """(F, B) codes as gather_probes.cl reads them: of harmonics one for each, plus 128. To work them out there took half as long again."""
-    if codes.factor_trim is None:
-        return codes.factor_code.view(np.uint8)
-    return expanded(codes.factor_code, 1 + codes.factor_trim.shape[2]).view(np.uint8) ^ np.uint8(128)
-
-
 def device_scale(codes: Codes) -> Float32:
     """(P, 2, B) float32. Of the cube: a square of a code times these is a weight. Of harmonics the first takes squares of codes to shares,
     and the others, times the first harmonic's squares, are what ``factor_trim`` adds to weights."""
@@ -119,9 +112,8 @@ def longest_direction(code: AnyArray) -> float:
 
 def sky_starts(factor_starts: AnyArray, is_sky: AnyArray) -> UInt32:
     """(P,) uint32: where each probe's sky patches begin among the factors, if its bricks come before them."""
-    before = np.concatenate([[0], np.cumsum(is_sky, dtype=np.uint32)])
-    ends = factor_starts[1:]
-    return (ends - (before[ends] - before[factor_starts[:-1]])).astype(np.uint32)
+    before = np.searchsorted(np.flatnonzero(is_sky), factor_starts)
+    return (factor_starts[1:] - (before[1:] - before[:-1])).astype(np.uint32)
 
 
 def _encode_roots(shares: AnyArray, row: AnyArray, rows: int, encode_root: Callable[[AnyArray], AnyArray]) -> tuple[AnyArray, AnyArray]:
@@ -169,8 +161,17 @@ def _roots_of_directions() -> Int8:
     return quantise.encode_signed_root(_polynomials(direction)[:, 1:] / AMPLITUDES[1:])
 
 
+@cache
+def device_roots() -> UInt8:
+    """``_roots_of_directions`` plus 128, as expand_factors.cl reads them."""
+    return _roots_of_directions().view(np.uint8) ^ np.uint8(128)
+
+
 def expanded(code: AnyArray, basis: int) -> Int8:
-    """Codes (F, 4) -> codes (F, basis) int8, one of each harmonic: the first, and that times the root of what its direction makes of it."""
+    """Codes (F, 4) -> codes (F, basis) int8, one of each harmonic: the first, and that times the root of what its direction makes of it.
+
+    Twin of ``kernels_cl/expand_factors.cl``. To work them out in each relight instead took half as long again.
+    """
     edge, offset = 2 * FACE_STEPS + 1, FACE_STEPS
     y, z, x = (code[:, k].astype(np.int32) + offset for k in (1, 2, 3))
     roots = _roots_of_directions()[(y * edge + z) * edge + x, : basis - 1]

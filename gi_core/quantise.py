@@ -41,7 +41,7 @@ def encode_unit(vectors: AnyArray) -> UInt8:
 
 def decode_unit(octahedral: AnyArray) -> Float32:
     """Octahedral (2, n) uint8 -> unit vectors (n, 3) float32."""
-    return _units()[octahedral[0], octahedral[1]]
+    return _units().reshape(-1, 3).take((octahedral[0].astype(np.uint16) << 8) | octahedral[1], axis=0)
 
 
 @cache

@@ -18,7 +18,7 @@ import pyopencl as cl
 
 from gi_core import factor_weights, relight_twin
 from gi_core.arrays import AnyArray, Float32, UInt32
-from gi_core.basis import FEEDBACK, basis_of_size, conversion
+from gi_core.basis import FEEDBACK, SH_NORM, basis_of_size, conversion
 from gi_core.constants import BASIS_SIZES
 from gi_core.device import Device
 from gi_core.layout import BOUNCE, MAX_DIRECTIONAL_LIGHTS
@@ -61,12 +61,12 @@ class ResidentSector:
         normal[:, : sector.surfel_count] = sector.surfel_normal.T
         self.surfel_normal = device.upload(normal)
         self.brick_starts = device.upload(sector.brick_starts)
-        self.brick_basis = None if sector.basis_size == BASIS_SIZES["cube"] else device.upload(relight_twin.brick_basis(sector))
+        self.brick_basis = None if sector.basis_size == BASIS_SIZES["cube"] else self._find_brick_basis()
         self.brick_emission = None if sector.surfel_emission is None else device.upload(_brick_emission(sector))
         self.factor_starts = device.upload(sector.factor_starts)
         self.factor_source = device.upload(sector.factor_source)
         self.sky_starts = device.upload(sector.sky_starts)
-        self.factor_code = device.upload(padded(factor_weights.device_code(sector.factor_codes)))
+        self.factor_code = _factor_code(device, sector)
         self.factor_scale = device.upload(padded(factor_weights.device_scale(sector.factor_codes)))
         self.voxel_probe, self.voxel_weight = (device.upload(values) for values in outdoor_blend(sector))
         self.cubes = device.allocate(sector.probe_count * sector.basis_size * 16)
@@ -231,6 +231,18 @@ class ResidentSector:
             padded[..., :3] = cubes
             cl.enqueue_copy(self.device.queue, self.cubes, padded)
 
+    def _find_brick_basis(self) -> cl.Buffer:
+        """(N, B) float32, worked out on the device."""
+        bricks, size = self.sector.brick_count, self.sector.basis_size
+        found = cl.Buffer(self.device.context, cl.mem_flags.READ_WRITE, max(4 * bricks * size, 16))
+        if bricks:
+            norm = self.device.upload(SH_NORM[:size].astype(np.float32))
+            normals = (self.surfel_normal, np.uint32(self.groups * SURFELS_PER_GROUP))
+            directional = np.float32(FEEDBACK[basis_of_size(size)].directional)
+            kernel = self.device.shared_kernel("brick_basis", BASIS_SIZE=size)
+            kernel.launch_1d(bricks, np.uint32(bricks), self.brick_starts, *normals, norm, directional, found)
+        return found
+
     def _about(self, bounce_starts: cl.Buffer | None, cubes: cl.Buffer) -> About:
         assert self._light is not None
         given = self._light.given
@@ -299,6 +311,21 @@ def _brick_emission(sector: Sector) -> Float32:
     assert sector.surfel_emission is not None
     means = relight_twin.brick_means(sector, sector.surfel_emission)
     return np.pad(np.float32(np.pi) * means, ((0, 0), (0, 1)))
+
+
+def _factor_code(device: Device, sector: Sector) -> cl.Buffer:
+    """(F, B) codes as gather_probes.cl reads them, and behind them VECTOR zeros. Of harmonics they are worked out on the device: there
+    are twice as many as files have, and NumPy took half of the time that a sector took to get there."""
+    basis, factors = sector.basis_size, sector.factor_count
+    if basis == BASIS_SIZES["cube"]:
+        return device.upload(padded(sector.factor_code))
+    found = cl.Buffer(device.context, cl.mem_flags.READ_WRITE, factors * basis + VECTOR)
+    cl.enqueue_fill_buffer(device.queue, found, np.uint8(0), factors * basis, VECTOR)
+    if factors:
+        kernel = device.shared_kernel("expand_factors", BASIS_SIZE=basis, FACE_STEPS=factor_weights.FACE_STEPS)
+        roots = device.upload_once(factor_weights.device_roots)
+        kernel.launch_1d(factors, np.uint32(factors), device.upload(sector.factor_code.T), roots, found)
+    return found
 
 
 def padded(values: AnyArray) -> AnyArray:

@@ -137,6 +137,18 @@ def _surfel_cells(brick_cell: AnyArray, brick_level: AnyArray, brick_starts: Any
     return brick_cell[of_surfel], BRICK_CELL_M * 2.0 ** brick_level[of_surfel, None]
 
 
+def _surfel_positions(brick_cell: AnyArray, brick_level: AnyArray, brick_starts: AnyArray, in_cell: AnyArray) -> Float32:
+    """(S, 3) [m]: the middles of the steps (3, S) that surfels stand on. Rounded once, at the end: until then all digits are kept."""
+    number = counts(brick_starts)
+    step = BRICK_CELL_M / _CELL_STEPS * 2.0**brick_level
+    first = step[:, None] * (_CELL_STEPS * brick_cell.astype(np.float64) + 0.5)
+    step_of_surfel = np.repeat(step, number)
+    found = np.empty((in_cell.shape[1], 3), np.float32)
+    for axis in range(3):
+        found[:, axis] = np.repeat(first[:, axis], number) + step_of_surfel * in_cell[axis]
+    return found
+
+
 def _sector(found: Container) -> Sector:
     take = found.take
     absent = _IN_HARMONICS if "factor_trim" not in found.arrays or found.version == 1 else frozenset()
@@ -155,9 +167,7 @@ def _sector(found: Container) -> Sector:
         raise CorruptFileError("expected no empty brick, and three coordinates of each")
     probe_position = take("probe_position", "i4", 2)
     codes = _codes(found, probe_position, lambda: brick_centres(brick_cell, brick_level, brick_starts, in_cell), factor_starts, source)
-    cell, size = _surfel_cells(brick_cell, brick_level, brick_starts)
     albedo = take("surfel_albedo", "u1", 2)
-    position = (cell + (in_cell.T.astype(np.float64) + 0.5) / _CELL_STEPS) * size
     feedback = take("feedback_probe", "u2", 2).T
     voxel_class = take("voxel_class", "u1", 3)
     voxel_probe, voxel_weight = _voxels(found, voxel_class)
@@ -183,7 +193,7 @@ def _sector(found: Container) -> Sector:
         brick_level=brick_level,
         brick_cell=brick_cell,
         brick_direction=take("brick_direction", "u1", 1),
-        surfel_position=np.ascontiguousarray(position, np.float32),
+        surfel_position=_surfel_positions(brick_cell, brick_level, brick_starts, in_cell),
         surfel_normal=quantise.decode_unit(take("surfel_normal", "u1", 2)),
         # The code next to 0.95 stands for 0.9535, and the bounces' convergence rests on the bound.
         surfel_albedo=np.minimum(quantise.decode_root(albedo.T if found.version == 1 else albedo), np.float32(ALBEDO_MAX)),
@@ -215,7 +225,8 @@ def _codes(found: Container, probe_position: AnyArray, centres: Callable[[], Flo
     for row, column in zip(expected, difference.T, strict=True):
         row += column  # wraps
     trim = np.ascontiguousarray(np.moveaxis(found.take("factor_trim", "i1", 3), 2, 0))
-    return Codes(container.interleaved(np.concatenate([weight, expected])), scale, trim)
+    # As four rows in memory: so they are checked, and so a device takes them.
+    return Codes(np.concatenate([weight, expected]).T, scale, trim)
 
 
 def _words(octets: AnyArray) -> AnyArray:
@@ -228,18 +239,19 @@ def _words(octets: AnyArray) -> AnyArray:
 def _voxels(found: Container, voxel_class: AnyArray) -> tuple[AnyArray, Float32]:
     """Probes (ny, nz, nx, K) uint16 and weights float32 of each voxel."""
     rank = 4 if found.version == 1 else 2
-    probe, code = (np.moveaxis(found.take(name, dtype, rank), 0, -1) for name, dtype in (("voxel_probe", "u2"), ("voxel_weight", "u1")))
-    if probe.shape != code.shape or code.shape[-1] * voxel_class.size > MAX_VOXEL_PROBES:
+    stored, code = found.take("voxel_probe", "u2", rank), found.take("voxel_weight", "u1", rank)
+    if stored.shape != code.shape or code.shape[0] * voxel_class.size > MAX_VOXEL_PROBES:
         raise CorruptFileError(f"expected as many weights as probes, and at most {MAX_VOXEL_PROBES} of all voxels")
     share = code.astype(np.float32)
-    weight = share / np.maximum(share.sum(axis=-1, keepdims=True), 1)
+    share /= np.maximum(share.sum(axis=0), 1)
+    probe, weight = (np.ascontiguousarray(np.moveaxis(values, 0, -1)) for values in (stored, share))
     if found.version > 1:
         codes = _unsigned(found, "voxel_list", 3)
         if codes.shape != voxel_class.shape:
             raise CorruptFileError(f"expected a list of probes for each of {voxel_class.shape} voxels, got {codes.shape}")
         number = voxel_lists.numbers(codes, len(probe))
-        probe, weight = probe[number], weight[number]
-    return np.ascontiguousarray(probe), np.ascontiguousarray(weight, np.float32)
+        probe, weight = probe.take(number, axis=0), weight.take(number, axis=0)
+    return probe, weight
 
 
 def _unsigned(found: Container, name: str, ndim: int, below: int = 1 << 16) -> AnyArray:

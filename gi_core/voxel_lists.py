@@ -58,18 +58,16 @@ def _ascending(probes: AnyArray, weights: AnyArray) -> tuple[UInt16, AnyArray]:
 
 def _in_place(probes: list[list[int]], weights: list[list[int]], slots: int) -> list[list[list[int]]]:
     """Of each list its probes and weights, each probe where the list before has it. Places left over keep that one's, without weight."""
-    before, found = [0] * slots, []
+    now, found = [0] * slots, []
     for probe, weight in zip(probes, weights, strict=True):
-        of_probe = {p: w for p, w in zip(probe, weight, strict=True) if w}
-        # The list before has a probe more than once where nothing came to take a place.
-        kept = [p if p in of_probe and p not in before[:k] else None for k, p in enumerate(before)]
-        fresh = [p for p in of_probe if p not in kept]
-        now, given = list(before), [0] * slots
-        for k, p in enumerate(kept):
-            if p is None and fresh:
-                now[k] = p = fresh.pop(0)
-            if p is not None:
-                given[k] = of_probe[p]
+        fresh = dict(zip(probe, weight, strict=True))
+        fresh.pop(_NONE, None)
+        # Out of ``fresh``, so once: the list before has a probe more than once where nothing came to take a place.
+        given = [fresh.pop(p, 0) for p in now]
+        now = now.copy()
+        if fresh:
+            free = (k for k, w in enumerate(given) if not w)
+            for k, (p, w) in zip(free, fresh.items(), strict=False):
+                now[k], given[k] = p, w
         found.append([now, given])
-        before = now
     return found

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from bake_jobs.choose import Chooser, Pairs, neighbour_pairs
+from bake_jobs.distinct import distinct
 from bake_jobs.fit import fit_weights
 
 
@@ -141,3 +142,13 @@ def test_a_fit_does_not_depend_on_what_is_fitted_beside_it():
     together = fit_weights(columns, target, prior, 0.01, 4)
     alone = np.concatenate([fit_weights(columns[n : n + 1], target[n : n + 1], prior[n : n + 1], 0.01, 4) for n in range(64)])
     np.testing.assert_allclose(together, alone, atol=1e-5)  # sums of twelve products in another order
+
+
+@pytest.mark.parametrize(("keys", "different"), [(0, 1), (1, 1), (20_000, 1), (20_000, 300), (20_000, 15_000), (20_000, 10**9)])
+def test_distinct_keys_are_those_that_sorting_finds(keys, different):
+    drawn = np.random.default_rng(keys + different).integers(-1, different, keys)
+    for some in (drawn, drawn * (1 << 33), -7 * drawn):  # neighbours, and keys that differ in their high bits alone
+        found, number = distinct(some)
+        expected, of_key = np.unique(some, return_inverse=True)
+        np.testing.assert_array_equal(found, expected)
+        np.testing.assert_array_equal(number, of_key)

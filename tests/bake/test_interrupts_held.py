@@ -1,12 +1,13 @@
-"""A worker that is just starting must not die of the Ctrl-C that its parent handles."""
+"""Workers that are just starting: they must not die of the Ctrl-C that their parent handles, and have one thread each."""
 
+import os
 import signal
 import subprocess
 import sys
 
 import pytest
 
-from bake_jobs.runner import _interrupts_held
+from bake_jobs.runner import _interrupts_held, _one_thread_each
 
 IS_BLOCKED = "import signal; print(signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, []))"
 
@@ -33,3 +34,12 @@ def test_an_interrupt_in_the_block_reaches_the_parent_when_it_ends() -> None:
     with pytest.raises(KeyboardInterrupt):
         interrupt_within()
     assert reached_the_end
+
+
+def test_processes_started_in_the_block_have_one_thread_but_where_they_were_given_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    with _one_thread_each():
+        assert (os.environ["OPENBLAS_NUM_THREADS"], os.environ["OMP_NUM_THREADS"]) == ("1", "3")
+    assert "OPENBLAS_NUM_THREADS" not in os.environ
+    assert os.environ["OMP_NUM_THREADS"] == "3"
