@@ -52,7 +52,10 @@ def clean_mesh(mesh: Mesh, where: str, rooms: tuple[Room, ...] = ()) -> tuple[Me
         degenerate=int((finite & flat).sum()), duplicate=len(first) - int(first.sum()), non_finite=int((~finite).sum())
     )
     if not len(kept):
-        raise SourceError(f"{where}: expected triangles with an area, found none among {len(mesh.triangles)} ({dropped})")
+        raise SourceError(
+            f"{where}: expected triangles with an area, found none among {len(mesh.triangles)}"
+            f" ({dropped.degenerate} without one, {dropped.non_finite} with NaN or Inf)"
+        )
     turn = _inside_out(used, triangles, rooms)
     triangles[turn] = triangles[turn][:, ::-1]
     albedo = np.clip(mesh.albedo[kept], 0, ALBEDO_MAX).astype(np.float32)

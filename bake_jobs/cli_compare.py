@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
@@ -16,6 +17,7 @@ from bake_jobs.compare_report import draw_chart, report_table, stored, write_jso
 from bake_jobs.lamp_file import load_lamps
 from bake_jobs.sanity import NonsenseError
 from bake_jobs.scene_source import load_scene
+from gi_core.constants import SECTOR_SIZE_M
 from gi_core.container import write_atomic
 from gi_core.dataset import Dataset, write_world
 from gi_core.errors import InputError
@@ -102,13 +104,12 @@ def run(
 def _store(dataset_path: Path, report: dict[str, Any], has_source: bool) -> None:
     """Keep a report in its dataset, or say why not."""
     dataset = Dataset.open(dataset_path)
-    known = dataset.world.sectors
-    at_edge = [(x, z) for x, z in report["sectors"] if any(SectorIndex(x + dx, z + dz) not in known for dx, dz in NEIGHBOURS)]
+    at_edge = [(x, z) for x, z in report["sectors"] if any(_left_out(dataset, SectorIndex(x + dx, z + dz)) for dx, dz in NEIGHBOURS)]
     reason = ""
     if dataset.world.bake_id != report["dataset"]:
         reason = "was baked anew in the meantime"
     elif at_edge and not has_source:
-        reason = f"sector {at_edge[0][0]},{at_edge[0][1]} is at the dataset's edge, and more of the city may lie beyond: name its --source"
+        reason = f"sector {at_edge[0][0]},{at_edge[0][1]} is at the edge of what was baked, and the city goes on beyond: name its --source"
     else:
         try:
             write_world(dataset.path, replace(dataset.world, error_report=stored(report, dataset.world.basis)))
@@ -116,6 +117,13 @@ def _store(dataset_path: Path, report: dict[str, Any], has_source: bool) -> None
             reason = error.strerror or str(error)
     if reason:
         print(f"sectorlight: {dataset_path}: the report was not stored: {reason}", file=sys.stderr)
+
+
+def _left_out(dataset: Dataset, index: SectorIndex) -> bool:
+    """Whether a sector that was not baked may hold some of the city: beyond the city's own bounds there is nothing to bake."""
+    low, high = dataset.world.bounds[:, [0, 2]]
+    corner = index.origin[[0, 2]]
+    return index not in dataset.world.sectors and bool(np.all((corner < high) & (corner + SECTOR_SIZE_M > low)))
 
 
 def split_states(text: str) -> list[str]:

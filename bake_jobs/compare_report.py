@@ -126,8 +126,10 @@ def report_table(report: dict[str, Any]) -> Table:
             percents = [_percent(numbers[name], signed=name == "bias") for name in ("median", "p95", "bias", "nrmse", "noise")]
             percents.insert(1, _range(numbers["median_ci"]))
             table.add_row(state if row == 0 else "", stage, f"{numbers['n']:,}", *percents, end_section=row == len(stages) - 1)
+    sectors = len(report["sectors"])
     table.caption = (
-        f"{len(report['sectors'])} sectors, seed {report['seed']}, {report['samples']} paths per reference value. "
+        f"{sectors} sector{'s' if sectors > 1 else ''}, seed {report['seed']}, {report['samples']} paths per reference value. "
+        f"95 % sure: of the median, less what the reference's own noise adds to it. "
         f"{report['open_air_called_solid']:.1%} of open-air voxels are called solid. floor: {report['floor_fill']}"
     )
     return table

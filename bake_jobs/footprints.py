@@ -27,6 +27,7 @@ LEVEL_HEIGHT_M = 3.2
 DEFAULT_HEIGHT_M = 3 * LEVEL_HEIGHT_M  # of a footprint that says nothing about its height
 MAX_HEIGHT_M = 2000.0  # taller than any building; beyond it the unit is wrong
 MIN_PART_AREA_M2 = 0.05  # slivers that repair leaves behind
+SAME_POINT_M = 1e-3  # a ring's points this close after one another are one
 FOUNDATION_M = 1.0  # how far walls go below the lowest ground near them, so that no gap opens
 MAX_POINTS = 20_000_000  # of all rings; a borough of New York is 1.2 million
 # Walls: brick, limestone, concrete, pale brick; each building takes one and scales it a little.
@@ -174,14 +175,22 @@ def _repaired_polygons(parts: list[_Part], xz: Float64) -> tuple[Any, Any]:
     ring_of_point = np.repeat(np.arange(len(ring_sizes)), ring_sizes)
     part_of_ring = np.repeat(np.arange(len(parts)), [len(part.rings) for part in parts])
     rings = shapely.linearrings(xz, indices=ring_of_point)
-    polygons = shapely.polygons(rings, indices=part_of_ring)
-    polygons = shapely.remove_repeated_points(polygons, 1e-3)
+    # GEOS raises for a ring that repeated points leave no other point of. Where it is a footprint's outer one, the footprint goes.
+    ring_starts = np.cumsum([0, *ring_sizes[:-1]])
+    reach = np.linalg.norm(xz - xz[ring_starts][ring_of_point], axis=1)
+    is_ring = np.maximum.reduceat(reach, ring_starts) > SAME_POINT_M
+    is_ring &= is_ring[np.searchsorted(part_of_ring, part_of_ring)]
+    part_of_polygon, polygon_of_ring = np.unique(part_of_ring[is_ring], return_inverse=True)
+    if not len(part_of_polygon):
+        return np.empty(0, object), part_of_polygon
+    polygons = shapely.polygons(rings[is_ring], indices=polygon_of_ring)
+    polygons = shapely.remove_repeated_points(polygons, SAME_POINT_M)
     broken = ~shapely.is_valid(polygons)
     polygons[broken] = shapely.make_valid(polygons[broken])
     # Repair may give several polygons, and lines and points where a footprint collapses.
     simple, part_of = shapely.get_parts(polygons, return_index=True)
     simple, deeper = shapely.get_parts(simple, return_index=True)
-    part_of = part_of[deeper]
+    part_of = part_of_polygon[part_of[deeper]]
     kept = (shapely.get_type_id(simple) == shapely.GeometryType.POLYGON) & (shapely.area(simple) > MIN_PART_AREA_M2)
     return simple[kept], part_of[kept]
 

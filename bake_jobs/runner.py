@@ -11,6 +11,7 @@ import os
 import shutil
 import signal
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -154,9 +155,11 @@ def bake(
             TextColumn("baking {task.fields[preset]}"),
             BarColumn(),
             MofNCompleteColumn(),
+            TextColumn("sectors in"),
             TimeElapsedColumn(),
-            TextColumn("left"),
+            TextColumn("and"),
             TimeRemainingColumn(),
+            TextColumn("to go"),
             console=console,
         ) as progress:
             task = progress.add_task("bake", total=len(wanted), completed=len(wanted) - len(tasks), preset=settings.preset)
@@ -299,11 +302,20 @@ def _start_worker(arrays_path: Path, scene: Scene, settings: BakeSettings, table
     """Build what all sectors of a worker share. Ctrl-C is the parent's to handle: a worker finishes its sector."""
     global _baker, _output  # noqa: PLW0603 - a process pool's initialiser has no other place to leave what its tasks share
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     if arrays_path.exists():
         with np.load(arrays_path, allow_pickle=False) as arrays:
             scene = Scene(**{**scene.__dict__, **{name: arrays[name] for name in arrays.files}})
     _baker = SectorBaker(scene, settings, table.directions, bake_id)
     _output = output
+
+
+def _end_with_parent() -> None:
+    """A parent that was killed closes nothing: its workers, who hold both ends of its queues, would wait for tasks for ever."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 @contextmanager

@@ -33,15 +33,14 @@ def print_summary(
         table.add_column(name, justify="left" if not name else "right")
     for name in ("probes", "surfels", "bricks", "factors", "voxels", "triangles"):
         table.add_row(name, f"{counts[name]:,}", f"{counts[name] / sectors:,.0f}")
-    table.add_row("sector files", f"{counts['bytes'] / 1e6:,.1f} MB", f"{counts['bytes'] / 1e3 / sectors:,.0f} kB")
-    table.add_row("geometry files", f"{counts['geometry_bytes'] / 1e6:,.1f} MB", f"{counts['geometry_bytes'] / 1e3 / sectors:,.1f} kB")
+    sizes = {"sector files": counts["bytes"], "geometry files": counts["geometry_bytes"]}
     if world.has_fine_voxels:
-        fine = sum(facts.fine_bytes or 0 for facts in world.sectors.values())
-        table.add_row("fine voxel files", f"{fine / 1e6:,.1f} MB", f"{fine / 1e3 / sectors:,.0f} kB")
-    table.add_row("distant texture", f"{distant_bytes / 1e6:,.1f} MB", f"{distant_bytes / 1e3 / sectors:,.1f} kB")
+        sizes["fine voxel files"] = sum(facts.fine_bytes or 0 for facts in world.sectors.values())
+    for name, size in {**sizes, "distant texture": distant_bytes}.items():
+        table.add_row(name, _size(size), f"{size / 1e3 / sectors:,.1f} kB")
     if baked:
         table.add_row("core time", f"{core_seconds:,.1f} s", f"{core_seconds / baked:,.2f} s")
-        table.add_row(f"time, {workers} processes", f"{wall_seconds:,.1f} s", f"{wall_seconds / baked:,.2f} s")
+        table.add_row(f"time, {workers} process{'es' if workers > 1 else ''}", f"{wall_seconds:,.1f} s", f"{wall_seconds / baked:,.2f} s")
     if world.estimated_error is not None:
         table.add_row("estimated error", "", f"{100 * world.estimated_error:.1f} %")
     console.print(table)
@@ -62,6 +61,10 @@ def print_summary(
     for count, text in notes:
         if count:
             console.print(f"{count:,} {text}")
+
+
+def _size(size: int) -> str:
+    return f"{size / 1e6:,.1f} MB" if size >= 1e6 else f"{size / 1e3:,.1f} kB"
 
 
 def print_own_errors(console: Console, world: WorldInfo, own: Mapping[SectorIndex, float]) -> None:

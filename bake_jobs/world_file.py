@@ -75,6 +75,7 @@ from gi_core.world import Decal, Location, Room
 
 HINT_KINDS = ("add", "forbid", "densify")
 MAX_ROOMS = 65_535  # a sector stores room numbers as uint16, and 0 is outdoors
+MAX_ROOM_M = 1000.0  # the largest halls; openings are looked for in every half metre or so of a room's faces
 Loader = Callable[[Path, MapFrame | None], SourceContent]
 
 
@@ -144,6 +145,9 @@ def _room(table: Table, folder: Path, load: Loader) -> Room:
     if "mesh" not in table:
         minimum, maximum = _box(table)
         table.refuse_unknown()
+        longest = max(high - low for low, high in zip(minimum, maximum, strict=True))
+        if longest > MAX_ROOM_M:
+            raise SourceError(f"{table.where}: expected a room of at most {MAX_ROOM_M:g} m on every axis, found {longest:g} m")
         return Room(name, minimum, maximum)
     path = folder / table.text("mesh", None)
     offset = table.vector("offset", (0.0, 0.0, 0.0))

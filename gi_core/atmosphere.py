@@ -14,7 +14,7 @@ import numpy as np
 from gi_core.air import ColumnsAt, disc_share, distance_to_top
 from gi_core.air_optics import AirOptics
 from gi_core.arrays import Float64
-from gi_core.bounces import BouncesAt, prepare_bounces
+from gi_core.bounces import BouncesAt
 from gi_core.constants import SKY_SHAPE
 
 # Aerosol absorbs a tenth of what it meets: continental average, Hess et al. 1998 (OPAC).
@@ -75,8 +75,3 @@ class Atmosphere:
 def atmosphere(haze: float, height_km: float) -> Atmosphere:
     """The air for a haze (aerosol optical depth at 550 nm) over a place at a height above the sea [km], 0..8."""
     return Atmosphere(haze, min(max(height_km, 0.0), HIGHEST_PLACE_KM))
-
-
-def prepare_hazes() -> None:
-    """Build what every haze needs (half a second), so that weather that sweeps through hazes never waits for a table."""
-    prepare_bounces(AEROSOL_ALBEDO)

@@ -1,7 +1,7 @@
 """Light that has bounced in the air twice or more: tables of an infinite series of isotropic bounces, at nodes of haze, blended between.
 
 Hillaire, "A Scalable and Production Ready Sky and Atmosphere Rendering Technique", EGSR 2020. A table takes 50 ms, a blend 1 ms: so a
-haze that changes all the time meets no more than the 15 nodes, and ``prepare_bounces`` can build them before it starts to change.
+haze that changes all the time meets no more than the 15 nodes.
 """
 
 import math
@@ -48,12 +48,6 @@ class BouncesAt:
     def towards(self, sine: Float64, ground_albedo: float) -> Float64:
         """(..., a, 8) for sines (..., a) of the sun's elevation at the points."""
         return rows_at(self.air + np.float32(ground_albedo) * self.ground, _REFINEMENT * _column(sine))
-
-
-def prepare_bounces(aerosol_albedo: float) -> None:
-    """Build all nodes now (half a second), so that no later haze has to wait for one."""
-    for node in range(_FIRST_NODE, _LAST_NODE + 1):
-        _log_tables(node, aerosol_albedo)
 
 
 def _at_heights(table: Float32, height_km: Float64) -> Float32:

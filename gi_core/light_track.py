@@ -57,8 +57,9 @@ class LightTrack:
         """
         assert self._weather_at is not None
         if rate == 0:
-            if self._standing is None or self._standing[0] != moment:
-                self._standing = moment, self._lighting(moment, self._weather_at)
+            utc = moment.astimezone(UTC)  # equal only to the same moment, also in the hour that clocks repeat
+            if self._standing is None or self._standing[0] != utc:
+                self._standing = utc, self._lighting(moment, self._weather_at)
             return self._standing[1]
         self._standing = None
         step_s = max(SHORTEST_STEP_S, 2.0 ** math.ceil(math.log2(max(rate * STEP_REAL_S, 1.0))))

@@ -1,7 +1,7 @@
 """From a place, a time and a weather to the light of that moment."""
 
 import math
-from datetime import datetime
+from datetime import UTC, datetime
 from functools import lru_cache
 from typing import TypeVar
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from gi_core.arrays import AnyArray, Float64
 from gi_core.atmosphere import Atmosphere, atmosphere
-from gi_core.clock_time import local_time, parse_time
+from gi_core.clock_time import local_time, parse_time, time_zone
 from gi_core.constants import SKY_SHAPE
 from gi_core.lighting import DirectionalLight, Lighting
 from gi_core.sky import ROWS, clear_sky, cube_of_sky, horizontal_illuminance, night_sky, with_clouds, with_fog
@@ -42,7 +42,8 @@ def make_lighting(location: Location, time: datetime | str, weather: Weather | s
     Raises UnknownTimeError and UnknownWeatherError (see ``parse_time`` and ``parse_weather``).
     """
     moment = parse_time(time, location) if isinstance(time, str) else local_time(time, location)
-    return _make_lighting(location, moment, as_weather(weather))
+    # Datetimes of one zone are equal when their clocks read the same, which they do for two hours in autumn: UTC tells these apart.
+    return _make_lighting(location, moment.astimezone(UTC), as_weather(weather))
 
 
 @lru_cache(maxsize=256)
@@ -75,7 +76,7 @@ def _make_lighting(location: Location, moment: datetime, weather: Weather) -> Li
     served = radiance[:ROWS].astype(np.float64)  # the cube belongs to the rounded map, which is the one that is handed out
     lights = [DirectionalLight(_frozen(d), _frozen(beam)) for d, beam in zip(directions, beams, strict=True)]
     return Lighting(
-        time=moment.isoformat(),
+        time=moment.astimezone(time_zone(location.timezone)).isoformat(),
         weather=weather.text,
         sun=lights[0],
         moon=lights[1],

@@ -26,5 +26,5 @@ def snow_attribute(normal: Float32, open_above: Callable[[Int64], Bool]) -> Floa
 
 
 def whitened(albedo: Float32, cover: Float32) -> Float32:
-    """Albedo (n, 3) blended to fresh snow's by how much of each surface is covered, (n,) of 0..1. As relight_bricks.cl does."""
+    """Albedo (n, 3) blended to fresh snow's by how much of each surface is covered, (n,) of 0..1. As snow.h does."""
     return np.asarray(albedo + cover[:, None] * (np.float32(SNOW_ALBEDO) - albedo), np.float32)

@@ -6,7 +6,7 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 
 from fastapi import Depends, FastAPI
-from fastapi.responses import FileResponse
+from fastapi.responses import FileResponse, HTMLResponse
 from fastapi.staticfiles import StaticFiles
 
 from server import problems
@@ -14,6 +14,8 @@ from server.dependencies import refuse_repeated_parameters
 from server.finished_replies import AnswerFromFinished
 from server.head_requests import HeadRequests
 from server.metrics import CountRequests, Metrics
+from server.openapi import describe
+from server.reference import reference_page
 from server.routes import (
     boxes,
     clock,
@@ -68,6 +70,8 @@ def app_of(service: Service) -> FastAPI:
         description="Errors are `application/problem+json` with a stable `code`. World frame: metres, Y up, X east, Z south.",
         dependencies=[Depends(refuse_repeated_parameters)],
         redirect_slashes=False,
+        docs_url=None,  # their pages load scripts from elsewhere
+        redoc_url=None,
         lifespan=lifespan,
     )
     app.state.service = service
@@ -77,6 +81,7 @@ def app_of(service: Service) -> FastAPI:
     app.add_middleware(HeadRequests)
     app.add_middleware(TellTotal)
     problems.install(app)
+    describe(app)
     stateless = (world, lighting, volume, distant, sectors, probes, decals, preview)
     for resource in (health, metrics_route, *stateless, clock, weather, live_settings, lights, boxes, players, player_volume, live):
         app.include_router(resource.router)
@@ -86,5 +91,9 @@ def app_of(service: Service) -> FastAPI:
     @app.get("/", include_in_schema=False)
     def viewer() -> FileResponse:
         return FileResponse(VIEWER / "index.html", headers={"Cache-Control": "no-cache"})
+
+    @app.get("/docs", include_in_schema=False)
+    def reference() -> HTMLResponse:
+        return HTMLResponse(reference_page(app.openapi()), headers={"Cache-Control": "no-cache"})
 
     return app

@@ -4,11 +4,12 @@ Exit status: 0 done; 2 the user's input is wrong; 1 our failure; 130 interrupted
 """
 
 import re
+import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated, NoReturn, cast
 
 import typer
 
@@ -23,18 +24,25 @@ BENCH_SOURCE = "procedural:midtown?blocks=1x1&seed=1"
 
 app = typer.Typer(
     help="Dynamic global illumination of a city: bake once, serve its light at any hour and weather.",
-    no_args_is_help=True,
     pretty_exceptions_enable=False,
     add_completion=False,
 )
+
+# Typer hands out only some of what it raises for arguments that it cannot read, and has moved the rest from Click into itself.
+USAGE_ERRORS = cast("tuple[type[typer.BadParameter], ...]", typer.BadParameter.__bases__)
 
 SectorRange = tuple[tuple[int, int], tuple[int, int]]
 
 
 def main() -> None:
     """Run the command line and exit with its status."""
+    # What ends services and containers is as good as Ctrl-C: a bake then says what it keeps, and leaves no workers behind.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        app()
+        sys.exit(app(sys.argv[1:] or ["--help"], standalone_mode=False))
+    except USAGE_ERRORS as error:
+        more = "" if error.ctx is None else f"; `{error.ctx.command_path} --help` tells more"
+        fail(error.format_message().rstrip(".") + more, 2)
     except (InputError, FormatError, SectorMissingError) as error:
         fail(str(error.args[0]) if error.args else error.code, 2)
     except SectorlightError as error:
@@ -128,10 +136,10 @@ def bake(
         fail(f"interrupted; {output} holds {kept} finished sectors, and the same command{again} bakes the rest", INTERRUPTED)
 
 
-@app.command()
+@app.command(context_settings={"ignore_unknown_options": True})  # -1,0 is a sector
 def info(
     dataset: Annotated[Path, typer.Argument(help="A baked dataset's folder.")],
-    sector: Annotated[str | None, typer.Argument(help="X,Z: one sector in detail; after -- when X is negative.")] = None,
+    sector: Annotated[str | None, typer.Argument(help="X,Z: one sector in detail.")] = None,
 ) -> None:
     """What a dataset holds: counts, bytes, settings, its error report."""
     from server.cli_info import show_dataset, show_sector
@@ -162,7 +170,7 @@ def compare(
         str | None, typer.Option(help="What was baked, wanted when --sectors of the bake left out what surrounds these sectors.")
     ] = None,
     lamps: Annotated[
-        Path | None, typer.Option(metavar="FILE.toml", help="Take its [[lamp]]s instead of the dataset's own; nothing is baked.")
+        Path | None, typer.Option(metavar="FILE.toml", help="Take this world file's lamps instead of the dataset's own; nothing is baked.")
     ] = None,
     json_path: Annotated[Path | None, typer.Option("--json", metavar="OUT", help="Write the report here.")] = None,
     plot_path: Annotated[Path | None, typer.Option("--plot", metavar="OUT.png", help="Draw medians and 95th percentiles here.")] = None,
@@ -222,14 +230,14 @@ def tradeoff(
 @app.command()
 def strip(
     dataset: Annotated[Path, typer.Argument(help="A baked dataset's folder.")],
-    eye: Annotated[str, typer.Option(metavar="X,Y,Z", help="Where the camera is [m].")],
-    look: Annotated[str, typer.Option(metavar="X,Y,Z", help="What it looks at [m].")],
+    eye: Annotated[str, typer.Option(metavar="X,Y,Z", help="Where the camera is, in metres.")],
+    look: Annotated[str, typer.Option(metavar="X,Y,Z", help="What it looks at, in metres.")],
     output: Annotated[Path, typer.Option("--output", "-o", metavar="OUT.png", help="The sheet.")],
     kind: Annotated[str, typer.Option(help="day: 24 hours; weather: every preset; settings: every knob of the artists' panel.")] = "day",
     time: Annotated[str, typer.Option(help="Of the weathers: local time.")] = "13:00",
     weather: Annotated[str, typer.Option(help="Of the hours and the settings.")] = "clear",
-    fov: Annotated[float, typer.Option(min=1, max=150, help="Horizontal angle [degrees].")] = 75,
-    width: Annotated[int, typer.Option(min=16, max=960, help="Of one picture [pixels].")] = 240,
+    fov: Annotated[float, typer.Option(min=1, max=150, help="Horizontal angle in degrees.")] = 75,
+    width: Annotated[int, typer.Option(min=16, max=960, help="Of one picture, in pixels.")] = 240,
     device: DeviceOption = None,
 ) -> None:
     """Draw one street in many lights, as one sheet of small labelled pictures."""

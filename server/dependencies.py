@@ -49,11 +49,15 @@ class StrictQuery(BaseModel):
 
 class LightingQuery(StrictQuery):
     time: str = Field(max_length=64, description="`13:00`, or ISO 8601 local time with a date", examples=["13:00"])
-    weather: str = Field(max_length=200, description="a preset that /v1/world lists", examples=["clear"])
+    weather: str = Field(
+        max_length=200,
+        description="a preset that /v1/world lists, at a strength as in `snow:0.7`, or with numbers as in `clear:haze=0.3`",
+        examples=["clear"],
+    )
 
 
 class SkyQuery(LightingQuery):
-    format: Literal["npy", "exr"] = "npy"
+    format: Literal["npy", "exr"] = Field("npy", description="npy: float32; exr: a picture")
 
 
 class PositionQuery(LightingQuery):
@@ -136,8 +140,8 @@ class DistantQuery(LightingQuery):
     light: DistantLight | None = Field(
         None, description="sky: the sky's direct light alone; full: sun, lamps as baked and all bounces too; none: full where it was baked"
     )
-    format: ArrayFormat = "npy"
-    encoding: Literal["f16"] = "f16"
+    format: ArrayFormat = Field("npy", description="npy: float32, exact; raw: a texture's bytes")
+    encoding: Literal["f16"] = Field("f16", description="of raw: RGBA halves; lux = rgb x scale")
 
 
 class ProbesQuery(PositionQuery):

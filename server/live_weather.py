@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import UTC, datetime
 from typing import Any
 
 from gi_core.epw_weather import EpwWeather
@@ -78,8 +78,10 @@ def blended(before: WeatherSource, after: WeatherSource, since: datetime, blend_
         reached = before.at(since)
         before = WeatherSource(lambda _: reached, {})
 
+    begin = since.astimezone(UTC)  # datetimes of one zone are subtracted as their clocks read, which change twice a year
+
     def at(moment: datetime) -> Weather:
-        share = (moment - since).total_seconds() / blend_s
+        share = (moment - begin).total_seconds() / blend_s
         if not 0 <= share < 1:
             # A clock that jumped back finds what is, not what was: the change was made.
             return after.at(moment)

@@ -17,12 +17,10 @@ A players file is a JSON list of objects, or TOML with a [[player]] for each:
 
 import json
 import tomllib
-from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from gi_core.container import write_atomic
 from gi_core.dataset import Dataset
 from gi_core.errors import InputError
 from gi_core.json_fields import LARGEST_INTEGER
@@ -112,14 +110,6 @@ def read_players(path: Path, eye_height: EyeHeight | None = None) -> tuple[Playe
             raise InputError(f"{path}: expected each id once, found {player.id!r} twice")
         seen.add(player.id)
     return players
-
-
-def write_players(path: Path, players: Iterable[Player]) -> None:
-    """Write a players file, whole or not at all, as JSON. Raises InputError for a name that would be read as TOML."""
-    if path.suffix.lower() == ".toml":
-        raise InputError(f"{path}: expected a .json file to keep players in, found a .toml file; its comments would be lost")
-    lines = [json.dumps(player.to_json(), allow_nan=False) for player in players]
-    write_atomic(path, ("[\n" + ",\n".join(lines) + "\n]\n").encode())
 
 
 def _path(members: Members, eye_height: EyeHeight | None, folder: Path | None) -> tuple[Point, ...] | None:

@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 from fastapi import Depends, Request, Security
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+from starlette.requests import ClientDisconnect
 
 from gi_core.errors import InputError
 from server.dependencies import ServiceDep
@@ -34,10 +35,13 @@ async def read_json_object(request: Request) -> dict[str, Any]:
     if length.isdecimal() and int(length[:20]) > MAX_BODY_BYTES:
         raise BodyTooLargeError(f"body: expected at most {MAX_BODY_BYTES} bytes, found {length[:20]}")
     body = bytearray()
-    async for part in request.stream():
-        body += part
-        if len(body) > MAX_BODY_BYTES:
-            raise BodyTooLargeError(f"body: expected at most {MAX_BODY_BYTES} bytes, found more")
+    try:
+        async for part in request.stream():
+            body += part
+            if len(body) > MAX_BODY_BYTES:
+                raise BodyTooLargeError(f"body: expected at most {MAX_BODY_BYTES} bytes, found more")
+    except ClientDisconnect as error:  # nobody reads the answer, but it is no failure of ours
+        raise InputError("body: expected all of it, found a client that went away") from error
     try:
         record = json.loads(body)
     except (ValueError, RecursionError) as error:

@@ -14,7 +14,7 @@ from server.live_models import BoxesReply, BoxReply, GoneReply
 from server.write_access import WRITE, JsonBody, body_schema
 
 router = APIRouter(prefix="/v1/boxes", tags=["live world"])
-IdInPath = Annotated[str, Path(alias="id", max_length=256)]
+IdInPath = Annotated[str, Path(alias="id", max_length=256, description="as /v1/boxes lists them")]
 _MEMBERS = {
     "position": "[x, y, z] of its middle, world metres",
     "half_size": "[x, y, z], half of its extent along its own axes [m], 0.01..100",

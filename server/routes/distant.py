@@ -1,6 +1,6 @@
 """The texture of distant sector probes."""
 
-from typing import Annotated
+from typing import Annotated, get_args
 
 from fastapi import APIRouter, Query, Request, Response
 
@@ -8,13 +8,18 @@ from gi_core.constants import SECTOR_SIZE_M
 from gi_core.engine import Distant
 from server.caching import Body, conditional, strong_etag
 from server.dependencies import DistantQuery, ServiceDep
-from server.encoding import MEDIA_TYPE, REPLY_VERSION, half_scale, half_texels, header_json, npy
+from server.encoding import MEDIA_TYPE, REPLY_VERSION, ArrayFormat, half_scale, half_texels, header_json, npy
+from server.openapi import NOT_CHANGED, reply
 from server.server_timing import Laps
 
 router = APIRouter(prefix="/v1", tags=["light"])
 
 
-@router.get("/distant", response_class=Response, responses={200: {"content": {media: {} for media in MEDIA_TYPE.values()}}})
+@router.get(
+    "/distant",
+    response_class=Response,
+    responses=reply(*(MEDIA_TYPE[name] for name in get_args(ArrayFormat)), headers=("Gi-Distant", "ETag"), more=NOT_CHANGED),
+)
 def distant(request: Request, service: ServiceDep, query: Annotated[DistantQuery, Query()]) -> Response:
     """Irradiance [lx] of one cube per sector, float32 (rows, cols, 6, 3); texel (0, 0) at the sector grid's north-west corner.
 

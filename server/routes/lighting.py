@@ -9,6 +9,7 @@ from server.dependencies import LightingQuery, ServiceDep, SkyQuery
 from server.encoding import MEDIA_TYPE, REPLY_VERSION, npy
 from server.exr import exr
 from server.models import LightingReply
+from server.openapi import NOT_CHANGED, reply
 
 router = APIRouter(prefix="/v1", tags=["light"])
 
@@ -24,7 +25,7 @@ def lighting(request: Request, service: ServiceDep, query: Annotated[LightingQue
 EXR_MEDIA_TYPE = "image/x-exr"
 
 
-@router.get("/sky", response_class=Response, responses={200: {"content": {MEDIA_TYPE["npy"]: {}, EXR_MEDIA_TYPE: {}}}})
+@router.get("/sky", response_class=Response, responses=reply(MEDIA_TYPE["npy"], EXR_MEDIA_TYPE, headers=("ETag",), more=NOT_CHANGED))
 def sky(request: Request, service: ServiceDep, query: Annotated[SkyQuery, Query()]) -> Response:
     """Sky radiance, float32 (64, 128, 3) in cd/m2 per channel, equirectangular, no sun disc, zero below the horizon.
 

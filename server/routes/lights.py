@@ -7,6 +7,17 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Path, Query, Response
 from fastapi.responses import JSONResponse
 
+from gi_core.lights import (
+    MAX_CONE_DEGREES,
+    MAX_LUMENS,
+    MAX_RANGE_M,
+    MAX_SIZE_M,
+    MAX_TEMPERATURE_K,
+    MIN_CONE_DEGREES,
+    MIN_RANGE_M,
+    MIN_SIZE_M,
+    MIN_TEMPERATURE_K,
+)
 from server.dependencies import NoQuery, ServiceDep
 from server.lamps_json import lamp_changed, lamp_from_json, lamp_to_json
 from server.live_access import TickerDep, WritingTickerDep, apply, apply_to, keep, reply_to
@@ -14,17 +25,17 @@ from server.live_models import GoneReply, LightReply, LightsReply
 from server.write_access import WRITE, JsonBody, body_schema
 
 router = APIRouter(prefix="/v1/lights", tags=["live world"])
-IdInPath = Annotated[str, Path(alias="id", max_length=256)]
+IdInPath = Annotated[str, Path(alias="id", max_length=256, description="as /v1/lights lists them")]
 _MEMBERS = {
     "kind": "`point`, `spot` or `area`",
     "position": "[x, y, z], world metres",
-    "lumens": "luminous flux",
+    "lumens": f"luminous flux [lm], 0..{MAX_LUMENS:g}",
     "color": "[r, g, b], linear; changes the colour, not how much light there is",
-    "temperature_k": "colour temperature, in place of color",
-    "range_m": "beyond it the lamp gives nothing",
-    "direction": "[x, y, z], of spots and areas",
-    "cone_degrees": "of a spot",
-    "size": "[width, height] of an area [m]",
+    "temperature_k": f"colour temperature, in place of color, {MIN_TEMPERATURE_K:g}..{MAX_TEMPERATURE_K:g}",
+    "range_m": f"beyond it the lamp gives nothing [m], {MIN_RANGE_M:g}..{MAX_RANGE_M:g}",
+    "direction": "[x, y, z], of spots and areas; of any length but 0",
+    "cone_degrees": f"full angle of a spot, {MIN_CONE_DEGREES:g}..{MAX_CONE_DEGREES:g}",
+    "size": f"[width, height] of an area [m], {MIN_SIZE_M:g}..{MAX_SIZE_M:g}",
     "schedule": "`always`, `night`, or local times as in `18:00-23:30`",
     "dynamic": "true for a lamp that moves all the time: it is worked out apart from those that stand still",
     "keep": "true: written to the server's --state file, and back after a restart",

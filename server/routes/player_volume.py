@@ -16,6 +16,7 @@ from server.encoding import MEDIA_TYPE, REPLY_VERSION
 from server.finished_replies import Body, names
 from server.live_access import TickerDep
 from server.live_state import LiveUnavailableError
+from server.openapi import reply
 from server.player_volumes import VolumeKey
 from server.routes.players import IdInPath
 from server.routes.volume import bytes_body, light_body, mask_body
@@ -32,7 +33,11 @@ CACHE_CONTROL = "no-cache"
 @router.get(
     "/{id}/volume",
     response_class=Response,
-    responses={200: {"content": {media: {} for media in MEDIA_TYPE.values()}}, 304: {"description": "the client has the latest"}},
+    responses=reply(
+        *MEDIA_TYPE.values(),
+        headers=("Gi-Volume", "Gi-Tick", "Gi-Boxes", "ETag"),
+        more={304: {"description": "the client has the latest, by `since` or If-None-Match"}},
+    ),
 )
 async def player_volume(
     request: Request, service: ServiceDep, ticker: TickerDep, name: IdInPath, query: Annotated[PlayerVolumeQuery, Query()]

@@ -13,11 +13,12 @@ from server.dependencies import NoQuery, ServiceDep
 from server.live_access import TickerDep, WritingTickerDep, apply, apply_to, keep, reply_to
 from server.live_models import GoneReply, PlayerReply, PlayersReply
 from server.live_state import LivePlayer
-from server.players import player_from_json
+from server.players import MAX_DWELL_S, player_from_json
+from server.street_walk import MAX_WALK_M, MIN_WALK_M
 from server.write_access import WRITE, JsonBody, body_schema
 
 router = APIRouter(prefix="/v1/players", tags=["live world"])
-IdInPath = Annotated[str, Path(alias="id", max_length=256)]
+IdInPath = Annotated[str, Path(alias="id", max_length=256, description="as /v1/players lists them")]
 _BODY = body_schema(
     {"id": "runner", "speed": 5, "path": [[10, 1.6, 8], [90, 1.6, 8]], "loop": True},
     {
@@ -25,10 +26,10 @@ _BODY = body_schema(
         "speed": "m/s, 0..200",
         "path": "points [x, y, z] in world metres, or a GeoJSON LineString; without one the player walks along streets",
         "loop": "true: the last point leads to the first; else back and forth",
-        "pause_s": "[shortest, longest] pause at each corner [s]",
-        "turn_s": "how long turning round on the spot takes [s]",
+        "pause_s": f"[shortest, longest] pause at each corner [s], 0..{MAX_DWELL_S:g}",
+        "turn_s": f"how long turning round on the spot takes [s], 0..{MAX_DWELL_S:g}",
         "seed": "of pauses, and of a walk along streets",
-        "walk_m": "how far a walk along streets goes before it turns back [m]",
+        "walk_m": f"how far a walk along streets goes before it turns back [m], {MIN_WALK_M:g}..{MAX_WALK_M:g}",
         "near": "[x, y, z] where a walk along streets starts",
         "keep": "true: written to the server's --state file, and back after a restart",
     },

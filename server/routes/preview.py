@@ -10,6 +10,7 @@ from server.caching import Body, conditional, strong_etag
 from server.camera import Camera
 from server.dependencies import PreviewQuery, ServiceDep, parse_vector
 from server.encoding import REPLY_VERSION
+from server.openapi import NOT_CHANGED, reply
 from server.preview import Look, city_radiance
 from server.preview_error import error_picture
 from server.service import Service
@@ -17,7 +18,7 @@ from server.service import Service
 router = APIRouter(prefix="/v1", tags=["pictures"])
 
 
-@router.get("/preview.png", response_class=Response, responses={200: {"content": {"image/png": {}}}})
+@router.get("/preview.png", response_class=Response, responses=reply("image/png", headers=("ETag",), more=NOT_CHANGED))
 def preview(request: Request, service: ServiceDep, query: Annotated[PreviewQuery, Query()]) -> Response:
     """The city at a time and in a weather, lit directly by sun, moon and lamps, indirectly by the volumes that /v1/volume serves.
 

@@ -3,7 +3,7 @@
 import hashlib
 from typing import Annotated
 
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import APIRouter, Path, Query, Request, Response
 
 from gi_core.constants import SECTOR_SIZE_M
 from gi_core.errors import CorruptFileError, SectorMissingError
@@ -12,10 +12,20 @@ from server.caching import FILE_CACHE_CONTROL, Body, conditional, has_current, s
 from server.dependencies import NoQuery, ServiceDep
 from server.encoding import REPLY_VERSION
 from server.models import SectorReply, SectorsReply
+from server.openapi import NOT_CHANGED, reply
 from server.ranges import file_reply
 from server.service import Service
 
 router = APIRouter(prefix="/v1/sectors", tags=["dataset"])
+SectorNumber = Annotated[int, Path(description="of the sector that covers [64 n, 64 n + 64) m in this direction")]
+_FILE = reply(
+    "application/octet-stream",
+    headers=("ETag",),
+    more={
+        206: {"description": "what `Range: bytes=...` asks for", **reply("application/octet-stream", headers=("Content-Range",))[200]},
+        **NOT_CHANGED,
+    },
+)
 
 
 @router.get("", response_model=SectorsReply)
@@ -32,8 +42,8 @@ def sectors(request: Request, service: ServiceDep, _: Annotated[NoQuery, Query()
     return conditional(request, strong_etag("sectors", REPLY_VERSION, service.dataset.digest), compute)
 
 
-@router.get("/{x},{z}", response_class=Response, responses={200: {"content": {"application/octet-stream": {}}}})
-def sector_file(request: Request, service: ServiceDep, x: int, z: int, _: Annotated[NoQuery, Query()]) -> Response:
+@router.get("/{x},{z}", response_class=Response, responses=_FILE)
+def sector_file(request: Request, service: ServiceDep, x: SectorNumber, z: SectorNumber, _: Annotated[NoQuery, Query()]) -> Response:
     """One baked sector file: byte ranges, immutable under its ETag."""
     index = SectorIndex(x, z)
     facts = service.dataset.world.sectors.get(index)

@@ -27,6 +27,7 @@ from server.encoding import (
     shared_exponent_scale,
     shared_exponent_texels,
 )
+from server.openapi import NOT_CHANGED, reply
 from server.server_timing import Laps
 
 router = APIRouter(prefix="/v1", tags=["light"])
@@ -34,7 +35,11 @@ router = APIRouter(prefix="/v1", tags=["light"])
 MAX_ROOMS_TOLD = 16
 
 
-@router.get("/volume", response_class=Response, responses={200: {"content": {media: {} for media in MEDIA_TYPE.values()}}})
+@router.get(
+    "/volume",
+    response_class=Response,
+    responses=reply(*MEDIA_TYPE.values(), headers=("Gi-Volume", "Gi-Residual", "ETag"), more=NOT_CHANGED),
+)
 def volume(request: Request, service: ServiceDep, query: Annotated[VolumeQuery, Query()]) -> Response:
     """Irradiance [lx] in the 32 x 16 x 32 voxels around a point, snapped to the world's lattice.
 

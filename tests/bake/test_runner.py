@@ -289,10 +289,11 @@ def expect_whole_and_resumable(folder, source, reference):
     assert all(times(folder)[name] == before[name] for name in finished)
 
 
-def test_an_interrupted_bake_leaves_whole_files_and_resumes_to_the_same_bytes(long_source, long_reference, tmp_path):
+@pytest.mark.parametrize("stop", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
+def test_an_interrupted_bake_leaves_whole_files_and_resumes_to_the_same_bytes(long_source, long_reference, tmp_path, stop):
     process = command(long_source, tmp_path, "--quality=draft", "--jobs=2")
     wait_for_sectors(tmp_path, process)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(stop)
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 130
     assert "Traceback" not in errors
@@ -311,6 +312,13 @@ def test_a_killed_worker_ends_the_bake_with_status_1_and_loses_nothing_finished(
     assert "a worker process was killed" in errors.splitlines()[-1]
     assert "Traceback" not in errors
     expect_whole_and_resumable(tmp_path, long_source, long_reference)
+
+
+def test_a_killed_bake_leaves_no_worker_behind(long_source, tmp_path):
+    process = command(long_source, tmp_path, "--quality=draft", "--jobs=2")
+    wait_for_sectors(tmp_path, process)
+    process.kill()
+    process.communicate(timeout=20)  # ends when the last process that can write there has
 
 
 def test_the_bake_id_names_scene_settings_seed_and_versions(source, monkeypatch):

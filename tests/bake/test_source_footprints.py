@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bake_jobs.footprints import FOUNDATION_M
+from bake_jobs.footprints import FOUNDATION_M, load_footprints
 from bake_jobs.geography import MapFrame
 from bake_jobs.rays import RayScene
 from bake_jobs.scene import scene_digest
@@ -86,6 +86,20 @@ def test_courtyards_multipolygons_and_repair(tmp_path):
     scene = load_scene(write(tmp_path / "odd.geojson", court, bow, pair))
     area = (1600 - 400) + 2 * 100 + 2 * 100
     assert volume(scene, ~split(scene)) == pytest.approx(area * (10 + FOUNDATION_M), rel=2e-3)
+
+
+def test_rings_that_are_one_point_are_left_out(tmp_path):
+    """A footprint of that kind goes, a courtyard of that kind is filled; the others stay what they are."""
+    dot, court = square(90, 0, 0, height=10), square(0, 0, 40, height=10)
+    court["geometry"]["coordinates"].append(square(0, 0, 5e-4)["geometry"]["coordinates"][0])
+    whole = write(tmp_path / "whole.geojson", square(0, 0, 40, height=10), square(200, 0, 20, height=10))
+    odd = write(tmp_path / "odd.geojson", court, dot, square(200, 0, 20, height=10))
+    frame = MapFrame(50.0, 8.0)
+    expected, found = (load_footprints(path, frame).mesh for path in (whole, odd))
+    assert np.array_equal(found.vertices, expected.vertices)
+    assert np.array_equal(found.triangles, expected.triangles)
+    with pytest.raises(SourceError, match="footprints with an area, found none among 1"):
+        load_scene(write(tmp_path / "dot.geojson", dot))
 
 
 def test_openstreetmap_heights(tmp_path):

@@ -113,6 +113,10 @@ WRONG = {
     "a date in quotes": (replaced("2024-12-21", '"2024-12-21"'), "date: expected a TOML date"),
     "a moment for a date": (replaced("2024-12-21", "2024-12-21T10:00:00"), "date: expected a TOML date"),
     "a room inside out": (replaced("maximum = [1, 2, 3]", "maximum = [1, -2, 3]"), r"\[\[room\]\] 1: expected minimum below maximum"),
+    "a room in millimetres": (
+        replaced("maximum = [1, 2, 3]", "maximum = [1200, 2, 3]"),
+        r"\[\[room\]\] 1: expected a room of at most 1000 m",
+    ),
     "a nameless room": (replaced('name = "hall"', ""), "expected the key name"),
     "a laser": (replaced('"spot"', '"laser"'), "kind: expected point or spot or area, found 'laser'"),
     "a dark lamp": (replaced("lumens = 800", "lumens = -1"), "lumens"),

@@ -1,18 +1,21 @@
 """Clocks that jump, run backwards and change, and whole days: the same moment is the same bytes, and neighbours are close."""
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, date, datetime, timedelta
 
 import numpy as np
 import pytest
 
 from gi_core import lighting_steps
-from gi_core.clock_time import time_zone
+from gi_core.clock_time import parse_time, time_zone
+from gi_core.light_track import LightTrack
 from gi_core.lighting import Lighting
 from gi_core.lighting_model import _make_lighting, make_lighting
 from gi_core.lighting_steps import FASTEST_DAY, FASTEST_PLACE, TOLERANCE, largest_steps, main
 from gi_core.lighting_table import illuminance
 from gi_core.sun import sun_position
+from gi_core.weather import parse_weather
 from gi_core.world import Location
 
 # In a second, at the equator, where light changes fastest. Twilight grows 3.2-fold a degree at most, and the sun climbs 0.0042 degrees a
@@ -124,3 +127,24 @@ def test_the_same_hour_of_neighbouring_days_differs_as_the_season_does() -> None
     picked = [illuminance(make_lighting(place, noon)) for noon in noons[::15]]
     ratios = np.exp(np.abs(np.diff(np.log(picked))))
     assert ratios.max() < 1.35  # fifteen days: 6 degrees of a winter sun that stands 26 degrees high
+
+
+def test_the_hour_that_clocks_repeat_is_two_hours() -> None:
+    """Whichever of them is asked for first: datetimes that differ in nothing but their offset look equal to a cache."""
+    first, second = (make_lighting(Location(), f"2024-11-03T01:30{offset}") for offset in ("-04:00", "-05:00"))
+    assert [light.time[-6:] for light in (first, second)] == ["-04:00", "-05:00"]
+    turned = math.degrees(math.acos(float(first.sun.direction @ second.sun.direction)))
+    assert turned == pytest.approx(15 * math.cos(math.radians(15)), abs=0.2)  # an hour of the path of a sun 15 degrees south
+
+
+def test_a_standing_clock_can_jump_from_one_of_the_repeated_hours_to_the_other() -> None:
+    first = parse_time("2024-11-03T01:30-04:00", Location())
+    with ThreadPoolExecutor(1) as worker:
+        track = LightTrack(Location(), worker)
+        track.set_weather(lambda _: parse_weather("clear"))
+        assert [track.at(moment, 0).time[-6:] for moment in (first, first.replace(fold=1))] == ["-04:00", "-05:00"]
+
+
+def test_the_last_evening_of_the_last_year_has_light() -> None:
+    """In UTC it is the next year already."""
+    assert make_lighting(Location(), "2599-12-31T23:00").time.startswith("2599-12-31T23:00:00")

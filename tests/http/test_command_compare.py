@@ -17,6 +17,7 @@ from gi_core import sector_file
 from gi_core.dataset import Dataset, write_world
 from gi_core.engine import Engine
 from gi_core.errors import InputError
+from gi_core.grid import SectorIndex
 
 RunCommand = Callable[..., Any]
 SOURCE = "procedural:midtown?blocks=1x1&seed=1"
@@ -24,9 +25,13 @@ SMALL = ("--sectors", "1", "--points", "3", "--samples", "16")
 
 
 def test_it_prints_a_table_and_writes_json_and_a_chart(sectorlight: RunCommand, city: Path, tmp_path: Path) -> None:
-    before = {path: path.stat().st_mtime_ns for path in city.rglob("*")}
+    part = tmp_path / "part"
+    shutil.copytree(city, part)
+    world = Dataset.open(part).world
+    write_world(part, replace(world, sectors={index: facts for index, facts in world.sectors.items() if index != SectorIndex(1, 0)}))
+    before = {path: path.stat().st_mtime_ns for path in part.rglob("*")}
     files = ("--json", str(tmp_path / "out.json"), "--plot", str(tmp_path / "out.png"))
-    done = sectorlight("compare", str(city), *SMALL, "--states", "noon,dusk=19:00/clear:haze=0.5,cloud_cover=0.2", *files)
+    done = sectorlight("compare", str(part), *SMALL, "--states", "noon,dusk=19:00/clear:haze=0.5,cloud_cover=0.2", *files)
     assert done.returncode == 0, done.stderr
     report = json.loads((tmp_path / "out.json").read_text())
     assert (report["preset"], report["basis"]) == ("draft", "cube")
@@ -40,8 +45,8 @@ def test_it_prints_a_table_and_writes_json_and_a_chart(sectorlight: RunCommand, 
         assert word in done.stdout
     with Image.open(tmp_path / "out.png") as picture:
         assert picture.format == "PNG"
-    # A single block ends where the bake does: what lies beyond may be missing, so its report is not believed, nor is anything written.
-    assert {path: path.stat().st_mtime_ns for path in city.rglob("*")} == before
+    # The city goes on beyond what was baked: light from there is missing, so the report is not believed, nor is anything written.
+    assert {path: path.stat().st_mtime_ns for path in part.rglob("*")} == before
     assert "the report was not stored: sector" in done.stderr
     assert "name its --source" in done.stderr
 
@@ -54,6 +59,11 @@ def test_the_report_stays_in_the_dataset_and_is_quoted(sectorlight: RunCommand, 
     assert done.returncode == 0, done.stderr
     measured, kept = json.loads((tmp_path / "out.json").read_text()), Dataset.open(copy).world.error_report
     assert kept is not None
+    # The whole city was baked: nothing beyond could be missing, and no source need be named.
+    write_world(copy, replace(Dataset.open(copy).world, error_report=None))
+    assert sectorlight("compare", str(copy), *SMALL, "--states", "noon").returncode == 0
+    assert Dataset.open(copy).world.error_report is not None
+    write_world(copy, replace(Dataset.open(copy).world, error_report=kept))
     assert kept["states"] == measured["states"]
     medians = [measured["states"][state]["shaded"]["median"] for state in ("noon", "overcast")]
     assert kept["expected_error"] == pytest.approx(np.median(medians))
@@ -96,7 +106,9 @@ def test_the_same_seed_gives_the_same_report(sectorlight: RunCommand, city: Path
     reports = []
     for number, seed in enumerate(("4", "4", "5")):
         path = tmp_path / f"{number}.json"
-        assert sectorlight("compare", str(city), *SMALL, "--states", "noon", "--seed", seed, "--json", str(path)).returncode == 0
+        assert (
+            sectorlight("compare", str(city), *SMALL, "--states", "noon", "--seed", seed, "--no-store", "--json", str(path)).returncode == 0
+        )
         reports.append(path.read_bytes())
     assert reports[0] == reports[1] != reports[2]
 

@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import re
 import shutil
 import signal
 import socket
@@ -36,10 +37,13 @@ def expect_refusal(done: Any, *words: str) -> None:
 
 
 def test_every_command_has_help(sectorlight: RunCommand) -> None:
-    for command in ([], ["bake"], ["info"], ["serve"], ["compare"], ["strip"], ["bench"], ["loadtest"]):
+    for command in ([], ["bake"], ["info"], ["serve"], ["compare"], ["tradeoff"], ["strip"], ["bench"], ["loadtest"]):
         done = sectorlight(*command, "--help")
         assert done.returncode == 0
         assert "Usage" in done.stdout
+        # What stands in brackets is formatting to the library that prints help, and vanishes.
+        assert not re.search(r" \.\s", done.stdout)
+    assert sectorlight().stdout == sectorlight("--help").stdout
 
 
 def test_help_needs_neither_baker_nor_server() -> None:
@@ -56,8 +60,20 @@ def test_version(sectorlight: RunCommand) -> None:
     assert (done.returncode, done.stdout) == (0, f"sectorlight {program_version()}\n")
 
 
-def test_a_wrong_option_is_the_user_s(sectorlight: RunCommand) -> None:
-    assert sectorlight("serve", "somewhere", "--prot", "1").returncode == 2
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (["serve", "somewhere", "--prot", "1"], "--prot"),
+        (["serve", "somewhere", "--port", "70000"], "65535"),
+        (["serve", "somewhere", "--sky-lux", "5"], "--sky FILE"),
+        (["bake"], "source"),
+        (["bake", SOURCE], "--output"),
+        (["bench", "--json"], "--json"),
+        (["boke"], "boke"),
+    ],
+)
+def test_arguments_that_cannot_be_read_are_one_clear_line(sectorlight: RunCommand, arguments: list[str], word: str) -> None:
+    expect_refusal(sectorlight(*arguments), word)
 
 
 def test_no_dataset_is_one_clear_line(sectorlight: RunCommand, tmp_path: Path) -> None:
@@ -103,10 +119,11 @@ def test_info_shows_the_dataset_and_a_sector(sectorlight: RunCommand, city: Path
     for word in ("draft", "probes", "surfels", "New_York"):
         assert word in done.stdout
     name = sorted(path.stem for path in (city / "sectors").iterdir())[0]
-    one = sectorlight("info", str(city), "--", name.replace("_", ","))
+    one = sectorlight("info", str(city), name.replace("_", ","))
     assert one.returncode == 0, one.stderr
     assert "factors" in one.stdout
-    expect_refusal(sectorlight("info", str(city), "900,900"), "900,900")
+    for nowhere in ("900,900", "-900,900"):
+        expect_refusal(sectorlight("info", str(city), nowhere), nowhere)
     expect_refusal(sectorlight("info", str(city), "north"), "expected X,Z")
 
 

@@ -1,5 +1,6 @@
 """Bad input is refused by name, as problem+json, and never as our failure."""
 
+import asyncio
 from collections.abc import Callable
 from typing import Any, get_args
 
@@ -7,8 +8,11 @@ import httpx
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from starlette.requests import Request
 
+from gi_core.errors import InputError
 from server.preview_views import ViewName
+from server.write_access import read_json_object
 
 ProblemOf = Callable[[httpx.Response], dict[str, Any]]
 GOOD = {"time": "12:00", "weather": "clear", "x": "0", "y": "5", "z": "0"}
@@ -82,6 +86,15 @@ def test_a_parameter_given_twice_is_refused(http: httpx.Client, problem_of: Prob
     reply = http.get("/v1/lighting?time=12:00&time=13:00&weather=clear")
     assert reply.status_code == 400
     assert "time" in problem_of(reply)["detail"]
+
+
+def test_a_client_that_goes_away_within_its_body_is_no_failure_of_ours() -> None:
+    async def receive() -> dict[str, str]:
+        return {"type": "http.disconnect"}
+
+    request = Request({"type": "http", "headers": [(b"content-type", b"application/json")]}, receive)
+    with pytest.raises(InputError, match="went away"):
+        asyncio.run(read_json_object(request))
 
 
 def test_other_methods_are_refused_with_what_is_allowed(http: httpx.Client, problem_of: ProblemOf) -> None:

@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -38,13 +39,20 @@ def test_the_api_documents_every_route(http: httpx.Client) -> None:
     paths = set(http.get("/openapi.json").json()["paths"])
     assert paths >= {"/healthz", "/readyz", "/v1/world", "/v1/lighting", "/v1/sky", "/v1/volume", "/v1/distant", "/v1/sectors"}
     assert paths >= {"/v1/sectors/{x},{z}", "/v1/probes", "/v1/decals", "/v1/decals/gradient.png", "/v1/preview.png"}
-    assert http.get("/docs").status_code == 200
+    page = http.get("/docs").text
+    assert all(f" {path}</h2>" in page for path in paths)
 
 
-def test_the_viewer_loads_nothing_from_elsewhere(http: httpx.Client) -> None:
-    page = http.get("/")
+@pytest.mark.parametrize("path", ["/", "/docs"])
+def test_pages_load_nothing_from_elsewhere(http: httpx.Client, path: str) -> None:
+    """They work where there is no internet, and nobody else's script runs beside a token of writes."""
+    page = http.get(path)
     assert page.headers["content-type"].startswith("text/html")
-    assert "//" not in page.text.replace("<!doctype html>", "")
+    assert not re.search(r"(src|href)=.?(https?:)?//", page.text)
+
+
+def test_the_viewer_has_its_files(http: httpx.Client) -> None:
+    page = http.get("/")
     for name in ("viewer.js", "viewer.css"):
         assert f'"viewer/{name}"' in page.text
         assert http.get(f"/viewer/{name}").status_code == 200
@@ -229,6 +237,31 @@ def test_head_is_get_without_the_body(http: httpx.Client, moment: dict[str, Any]
         assert (head.status_code, head.content) == (whole.status_code, b"")
         for name in ("content-length", "content-type", "etag", "gi-volume"):
             assert head.headers.get(name) == whole.headers.get(name)
+
+
+def test_headers_statuses_and_media_types_are_described_as_they_are_sent(
+    http: httpx.Client, moment: dict[str, Any], place: dict[str, Any]
+) -> None:
+    paths = http.get("/openapi.json").json()["paths"]
+    asked = {
+        "/v1/volume": {**moment, **place},
+        "/v1/distant": moment,
+        "/v1/sky": moment,
+        "/v1/preview.png": {**moment, "eye": "30,20,90", "look": "30,5,30", "width": 16},
+    }
+    for path, query in asked.items():
+        described = paths[path]["get"]["responses"]["200"]
+        sent = http.get(path, params=query)
+        ours = {name for name in sent.headers if name.startswith("gi-") or name == "etag"}
+        assert ours == {name.lower() for name in described["headers"]}
+        for name in paths[path]["get"]["parameters"]:
+            for value in name["schema"].get("enum", []) if name["name"] == "format" else []:
+                assert http.get(path, params={**query, "format": value}).headers["content-type"] in described["content"]
+    for path, methods in paths.items():
+        for method, operation in methods.items():
+            assert "422" not in operation["responses"], f"{method} {path}"  # nothing answers so: what is wrong is a 400
+            assert list(operation["responses"]["4XX"]["content"]) == ["application/problem+json"]
+            assert all(parameter["description"] for parameter in operation.get("parameters", [])), f"{method} {path}"
 
 
 def test_every_route_is_described(http: httpx.Client) -> None:

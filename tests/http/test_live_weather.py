@@ -1,6 +1,7 @@
 """One weather turns into another."""
 
 from datetime import UTC, datetime, timedelta
+from zoneinfo import ZoneInfo
 
 import pytest
 
@@ -28,6 +29,16 @@ def test_a_blend_starts_and_ends_where_it_should() -> None:
     assert numbers(blend.at(after(50))) == pytest.approx(middle)
     assert blend.description == {"weather": "fog"}
     assert blended(clear, fog, NOON, 0) is fog
+
+
+def test_a_blend_takes_as_long_when_clocks_go_back_meanwhile() -> None:
+    zone = ZoneInfo("America/New_York")
+    since = datetime(2024, 11, 3, 1, 30, tzinfo=zone)  # half an hour before
+    blend = blended(fixed_weather("clear"), fixed_weather("fog"), since, 3600)
+    # 01:15 for the second time: three quarters of the hour have passed.
+    assert blend.at(datetime(2024, 11, 3, 1, 15, fold=1, tzinfo=zone)) == blended(
+        fixed_weather("clear"), fixed_weather("fog"), NOON, 3600
+    ).at(after(2700))
 
 
 def test_a_script_goes_on_while_another_weather_takes_over() -> None:
