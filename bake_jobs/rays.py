@@ -63,7 +63,7 @@ class RayScene:
         direction = np.ascontiguousarray(directions, np.float32)
         if self._empty or n == 0:
             return Hits(np.full(n, np.inf, np.float32), np.full(n, -1, np.int32), np.zeros((n, 3), np.float32), np.zeros(n, bool))
-        origin = np.ascontiguousarray(np.asarray(origins, np.float64) - self.anchor, np.float32)
+        origin = self.local(origins)
         found = self._scene.run(origin, direction, output=True)
         triangle = found["primID"].astype(np.int32)
         hit = triangle >= 0
@@ -74,12 +74,19 @@ class RayScene:
         normal[from_back] *= -1
         return Hits(distance, triangle, normal, from_back)
 
+    def local(self, points: Float64) -> Float32:
+        """Points (n, 3) [m], world frame, as rays start from them: single precision from the anchor."""
+        return np.ascontiguousarray(np.asarray(points, np.float64) - self.anchor, np.float32)
+
     def occluded(self, origins: Float64, directions: Float64 | Float32, distance: Float64 | Float32 | None = None) -> Bool:
         """Whether anything lies along each ray within ``distance`` (n,) [m]; anywhere when it is None. -> (n,) bool."""
-        n = len(origins)
+        return self.occluded_from(self.local(origins), directions, distance)
+
+    def occluded_from(self, origin: Float32, directions: Float64 | Float32, distance: Float64 | Float32 | None = None) -> Bool:
+        """``occluded`` from origins (n, 3) of ``local``: for points that many rays start from."""
+        n = len(origin)
         if self._empty or n == 0:
             return np.zeros(n, bool)
-        origin = np.ascontiguousarray(np.asarray(origins, np.float64) - self.anchor, np.float32)
         direction = np.ascontiguousarray(directions, np.float32)
         reach = np.full(n, FAR_M, np.float32) if distance is None else np.ascontiguousarray(distance, np.float32)
         return np.asarray(self._scene.run(origin, direction, dists=reach, query="OCCLUDED") >= 0)

@@ -19,11 +19,11 @@ def bake_visibility(ray_scene: RayScene, surfels: Surfels, origin: Float64, dire
     count = surfels.count
     words = (count + 31) // 32
     visible = np.zeros((len(directions), words * 32), bool)
-    start = surfels.position + origin + surfels.normal * START_OFFSET_M
-    facing = surfels.normal @ directions.T.astype(np.float32) > 0  # (S, D)
+    start = ray_scene.local(surfels.position + origin + surfels.normal * START_OFFSET_M)
+    facing = np.ascontiguousarray((surfels.normal @ directions.T.astype(np.float32) > 0).T)  # (D, S)
     for plane, direction in enumerate(directions.astype(np.float32)):
-        lit = np.flatnonzero(facing[:, plane])
-        visible[plane, lit] = ~ray_scene.occluded(start[lit], np.tile(direction, (len(lit), 1)))
+        lit = np.flatnonzero(facing[plane])
+        visible[plane, lit] = ~ray_scene.occluded_from(start.take(lit, axis=0), np.tile(direction, (len(lit), 1)))
     return pack_bits(visible)
 
 

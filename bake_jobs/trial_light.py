@@ -78,15 +78,14 @@ class TrialScene:
         anchor = self._rays.anchor
         for start in range(0, len(points), POINTS_AT_ONCE):
             some = points[start : start + POINTS_AT_ONCE]
-            # Direction by direction: rays that run side by side are a sixth faster.
-            hits = self._rays.closest(np.tile(some, (len(direction), 1)), np.repeat(direction, len(some), axis=0))
-            distance = hits.distance.reshape(-1, len(some))
-            clearance[start : start + len(some)] = distance.min(axis=0)
+            hits = self._rays.closest(np.repeat(some, len(direction), axis=0), np.tile(direction, (len(some), 1)))
+            distance = hits.distance.reshape(len(some), -1)
+            clearance[start : start + len(some)] = distance.min(axis=1)
             # A ray into a corner may end a rounding beyond the edge, in the next cell: keys are taken a little before the end.
             reach = np.where(np.isfinite(distance), distance - np.float32(KEY_OFFSET_M), 0)[:, :, None]
-            at = (some - anchor).astype(np.float32) + direction[:, None] * reach
+            at = (some - anchor).astype(np.float32)[:, None] + direction * reach
             key = _cell_keys(at.reshape(-1, 3), hits, distance.reshape(-1))
-            keys[start : start + len(some)] = key.reshape(-1, len(some)).T
+            keys[start : start + len(some)] = key.reshape(len(some), -1)
         return keys, clearance
 
     def _exitance(self, keys: Int64) -> Float32:
@@ -124,9 +123,9 @@ class TrialScene:
         """(k, suns): cosine to each sun where it is seen, otherwise 0."""
         directions = self.states.sun_direction.astype(np.float32)
         cosine = np.maximum(normal @ directions.T, 0)
-        # Sun by sun: rays that run side by side are a sixth faster.
+        # Sun by sun: rays that run side by side are a tenth faster.
         sun, cell = np.nonzero(np.ascontiguousarray((cosine > 0).T))
-        blocked = self._rays.occluded(start[cell], directions[sun])
+        blocked = self._rays.occluded_from(self._rays.local(start).take(cell, axis=0), directions.take(sun, axis=0))
         cosine[cell[blocked], sun[blocked]] = 0
         return cosine
 
