@@ -14,7 +14,7 @@ VolumeFormat = Literal["npy", "raw", "ktx2"]
 RawEncoding = Literal["f16", "rgb9e5"]
 
 # Changes whenever the bytes of a reply change for the same data; part of every ETag.
-REPLY_VERSION = 8
+REPLY_VERSION = 9
 
 HALF_MAX = 65504.0
 SHARED_EXPONENT_MAX = 65408.0  # 511 / 512 x 2^16

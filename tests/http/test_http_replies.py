@@ -15,6 +15,8 @@ import pytest
 from gi_core import distant_file
 from gi_core.constants import VOLUME_SHAPE, VOXEL_SIZE_M
 from server.app import create_app
+from server.live_state import MAX_BOXES, MAX_LAMPS
+from server.players import MAX_PLAYERS
 from server.settings import Settings
 
 LIGHTS = {"": {}, "sky": {"light": "sky"}, "full": {"light": "full"}}
@@ -63,6 +65,10 @@ def test_the_world_says_what_may_be_asked(http: httpx.Client) -> None:
     assert world["sectors"]["count"] == len(http.get("/v1/sectors").json()["sectors"]) > 0
     assert world["sectors"]["size_m"] == 64
     assert world["dataset"]["digest"] == http.get("/readyz").json()["dataset"]
+    limits = world["limits"]
+    assert (limits["players"], limits["lights"], limits["boxes"]) == (MAX_PLAYERS, MAX_LAMPS, MAX_BOXES)
+    too_long = http.put("/v1/clock", content=b" " * (limits["body_bytes"] + 1), headers={"Content-Type": "application/json"})
+    assert too_long.status_code == 413
 
 
 def test_every_weather_that_the_world_lists_gives_light(http: httpx.Client) -> None:
