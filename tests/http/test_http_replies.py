@@ -55,7 +55,9 @@ def test_the_viewer_has_its_files(http: httpx.Client) -> None:
     page = http.get("/")
     for name in ("viewer.js", "viewer.css"):
         assert f'"viewer/{name}"' in page.text
-        assert http.get(f"/viewer/{name}").status_code == 200
+        file = http.get(f"/viewer/{name}")
+        assert (file.status_code, file.headers["cache-control"]) == (200, "no-cache")
+        assert http.get(f"/viewer/{name}", headers={"If-None-Match": file.headers["etag"]}).status_code == 304
 
 
 def test_the_world_says_what_may_be_asked(http: httpx.Client) -> None:
