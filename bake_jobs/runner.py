@@ -71,14 +71,14 @@ class DatasetWriteError(SectorlightError, OSError):
 
 
 @contextmanager
-def _writing(path: Path) -> Iterator[None]:
-    """Tell what could not be written and what to do, instead of a traceback."""
+def _writing(path: Path, elsewhere: str = "choose another --output") -> Iterator[None]:
+    """Tell what could not be written and what to do, instead of a traceback. ``elsewhere``: how to have it written in another place."""
     try:
         yield
     except OSError as error:
         raise DatasetWriteError(
             f"{error.filename or path}: {error.strerror or error}; finished sectors are kept: "
-            "make room or choose another --output, and start the same bake again"
+            f"make room or {elsewhere}, and start the same bake again"
         ) from error
 
 
@@ -379,7 +379,7 @@ def _run(
     empty = Scene(**{**scene.__dict__, **{n: getattr(scene, n)[:0] for n in names}})
     with tempfile.TemporaryDirectory(prefix="sectorlight-") as folder, _one_thread_each():
         arrays_path = Path(folder) / "scene.npz"
-        with _writing(arrays_path):
+        with _writing(arrays_path, "set TMPDIR to another folder"):
             np.savez(arrays_path, **{n: getattr(scene, n) for n in names})
         pool = ProcessPoolExecutor(
             workers,

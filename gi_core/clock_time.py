@@ -12,7 +12,7 @@ FIRST_YEAR, LAST_YEAR = 1600, 2599
 ALLOWED_TIMES = "HH:MM, HH:MM:SS, or ISO 8601 local time such as 2024-06-21T13:00 (an offset like -04:00 or Z may follow)"
 
 _CLOCK = r"(?P<hour>\d{2}):(?P<minute>\d{2})(?::(?P<second>\d{2}))?"
-_TIME = re.compile(rf"(?:(?P<date>\d{{4}}-\d{{2}}-\d{{2}})[T ])?{_CLOCK}(?P<offset>Z|[+-]\d{{2}}:\d{{2}})?", re.ASCII)
+_TIME = re.compile(rf"(?:(?P<date>\d{{4}}-\d{{2}}-\d{{2}})[T ])?{_CLOCK}(?P<offset>Z|[+ -]\d{{2}}:\d{{2}})?", re.ASCII)
 _LONGEST_ECHO = 60
 
 
@@ -21,7 +21,8 @@ def parse_time(text: str, location: Location) -> datetime:
 
     ``13:00`` and ``13:00:30`` mean ``location.date``; ISO 8601 names its own date. An offset is honoured and the result converted to
     the location's zone. Where clocks go back, a time that occurs twice means the first one (an offset tells the second). Where
-    clocks go forward, a time that is skipped is read with the offset before the change: 02:30 becomes 03:30.
+    clocks go forward, a time that is skipped is read with the offset before the change: 02:30 becomes 03:30. The + of an offset may be a
+    space, which is what a + becomes in a URL.
 
     Raises UnknownTimeError for anything else, and for years outside 1600..2599.
     """
@@ -32,7 +33,8 @@ def parse_time(text: str, location: Location) -> datetime:
         day = date.fromisoformat(match["date"]) if match["date"] else location.date
         clock = time(int(match["hour"]), int(match["minute"]), int(match["second"] or 0))
         # ``Z`` and offsets go through the standard parser, which knows their bounds.
-        moment = datetime.fromisoformat(f"{day.isoformat()}T{clock.isoformat()}{match['offset'] or ''}")
+        offset = (match["offset"] or "").replace(" ", "+")
+        moment = datetime.fromisoformat(f"{day.isoformat()}T{clock.isoformat()}{offset}")
     except ValueError as error:
         raise UnknownTimeError(f"time {text[:_LONGEST_ECHO]!r}: {error}; expected {ALLOWED_TIMES}") from error
     return local_time(moment, location)

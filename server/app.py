@@ -4,8 +4,9 @@ import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
+from typing import Any
 
-from fastapi import Depends, FastAPI
+from fastapi import Depends, FastAPI, Response
 from fastapi.responses import FileResponse, HTMLResponse
 from fastapi.staticfiles import StaticFiles
 
@@ -47,6 +48,15 @@ from server.version import program_version
 VIEWER = Path(__file__).parent / "viewer"
 
 
+class _ViewerFiles(StaticFiles):
+    """Asked for anew each time, as the page is: left to guess, browsers keep the scripts of a server that was since replaced for days."""
+
+    def file_response(self, *args: Any, **kwargs: Any) -> Response:
+        response = super().file_response(*args, **kwargs)
+        response.headers["Cache-Control"] = "no-cache"
+        return response
+
+
 def create_app(dataset_path: Path, settings: Settings) -> FastAPI:
     """An application that serves one dataset; InputError or FormatError when the dataset or the device cannot be used."""
     return app_of(Service.open(dataset_path, settings.checked()))
@@ -86,7 +96,7 @@ def app_of(service: Service) -> FastAPI:
     for resource in (health, metrics_route, *stateless, clock, weather, live_settings, lights, boxes, players, player_volume, live):
         app.include_router(resource.router)
     app.router.routes.append(player_stream.route)
-    app.mount("/viewer", StaticFiles(directory=VIEWER), name="viewer")
+    app.mount("/viewer", _ViewerFiles(directory=VIEWER), name="viewer")
 
     @app.get("/", include_in_schema=False)
     def viewer() -> FileResponse:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 from fastapi import Request, Response
 
-from server.dependencies import get_service
+from server.dependencies import service_of
 from server.finished_replies import Body, FinishedReply, names, target_of
 from server.server_timing import Laps
 
@@ -40,7 +40,7 @@ def conditional(
     """
     if has_current(request, etag):
         return Response(status_code=304, headers={"ETag": etag, "Cache-Control": cache_control})
-    replies = get_service(request).replies
+    replies = service_of(request).replies
     reply, laps = replies.get(etag), laps or Laps()
     is_new = reply is None
     if reply is None:

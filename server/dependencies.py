@@ -209,7 +209,8 @@ class NoQuery(StrictQuery):
     """For routes that take no parameters."""
 
 
-def refuse_repeated_parameters(request: HTTPConnection) -> None:
+# Dependencies are coroutines though they wait for nothing: plain functions are called in a thread of the pool, which may be long in coming.
+async def refuse_repeated_parameters(request: HTTPConnection) -> None:
     """InputError when a parameter is given twice: either value may be the one that was meant."""
     names = [name for name, _ in request.query_params.multi_items()]
     repeated = sorted({name for name in names if names.count(name) > 1})
@@ -217,11 +218,15 @@ def refuse_repeated_parameters(request: HTTPConnection) -> None:
         raise InputError(f"query: expected each parameter once, found {repeated[0][:40]} more than once")
 
 
-def get_service(request: HTTPConnection) -> Service:
+def service_of(request: HTTPConnection) -> Service:
     """The running server's service."""
     service = request.app.state.service
     assert isinstance(service, Service)
     return service
 
 
-ServiceDep = Annotated[Service, Depends(get_service)]
+async def _service(request: HTTPConnection) -> Service:
+    return service_of(request)
+
+
+ServiceDep = Annotated[Service, Depends(_service)]

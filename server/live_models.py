@@ -18,11 +18,11 @@ class ClockReply(BaseModel):
 
 class WeatherNow(BaseModel):
     text: str = Field(description="what `weather` of a query takes to get this very weather")
-    cloud_cover: float
-    cloud_transmission: float
-    haze: float
-    fog_density: float
-    snow: float
+    cloud_cover: float = Field(description="0..1, share of the sky")
+    cloud_transmission: float = Field(description="of light through clouds, 0..1")
+    haze: float = Field(description="aerosol optical depth at 550 nm")
+    fog_density: float = Field(description="extinction per metre")
+    snow: float = Field(description="0..1")
 
 
 class WeatherReply(BaseModel):
@@ -36,10 +36,10 @@ class SettingsReply(BaseModel):
     sky_factor: float
     sun_factor: float
     lights_factor: float
-    sky_boost: Vector3
+    sky_boost: Vector3 = Field(description="cd/m2")
     ambient_factor: float
-    ambient_up: Vector3
-    ambient_down: Vector3
+    ambient_up: Vector3 = Field(description="lux")
+    ambient_down: Vector3 = Field(description="lux")
     exterior_ambient_scale: float
     interior_ambient_scale: float
     tick: int = _TICK
@@ -48,13 +48,13 @@ class SettingsReply(BaseModel):
 class Light(BaseModel):
     id: str
     kind: str
-    position: Vector3
+    position: Vector3 = Field(description="world metres")
     lumens: float
-    color: Vector3
+    color: Vector3 = Field(description="linear; its ratios alone count")
     range_m: float
-    direction: Vector3
-    cone_degrees: float
-    size: tuple[float, float]
+    direction: Vector3 = Field(description="of spots and areas")
+    cone_degrees: float = Field(description="full angle of a spot")
+    size: tuple[float, float] = Field(description="width and height of an area [m]")
     schedule: str
     dynamic: bool
     keep: bool
@@ -96,14 +96,14 @@ class Whereabouts(BaseModel):
 
 
 class PlayerReply(Whereabouts):
-    speed: float
+    speed: float = Field(description="m/s")
     path: list[Vector3] | None = Field(None, description="null for a walk along streets")
     loop: bool
-    pause_s: tuple[float, float]
+    pause_s: tuple[float, float] = Field(description="shortest and longest at a corner")
     turn_s: float
     seed: int
     walk_m: float
-    near: Vector3 | None = None
+    near: Vector3 | None = Field(None, description="world metres")
     tick: int = _TICK
 
 

@@ -47,13 +47,13 @@ class FogReply(BaseModel):
 
 
 class LightingReply(BaseModel):
-    time: str
-    weather: str
-    sun: LightReply
-    moon: LightReply
+    time: str = Field(description="local time with offset, ISO 8601")
+    weather: str = Field(description="what `weather` of a query takes to get this very weather")
+    sun: LightReply = Field(description="`direction`, unit, towards it, world frame; `irradiance` [lx] on a surface that faces it")
+    moon: LightReply = Field(description="the same")
     sky_cube: list[Vector3] = Field(description="lux of the unobstructed sky along +X -X +Y -Y +Z -Z")
-    snow: float
-    fog: FogReply
+    snow: float = Field(description="0..1, how much of what lies open to the sky is white")
+    fog: FogReply = Field(description="`density`: extinction per metre")
     exposure: float = Field(description="EV100 that suits the scene")
 
     @classmethod
@@ -71,8 +71,8 @@ class LightingReply(BaseModel):
 
 
 class BoundsReply(BaseModel):
-    minimum: Vector3
-    maximum: Vector3
+    minimum: Vector3 = Field(description="world metres")
+    maximum: Vector3 = Field(description="world metres")
 
 
 class LocationReply(BaseModel):
@@ -80,9 +80,9 @@ class LocationReply(BaseModel):
     longitude_degrees: float
     elevation_m: float
     timezone: str
-    north_degrees: float
+    north_degrees: float = Field(description="compass azimuth of -Z")
     date: str = Field(description="the day that a bare HH:MM means")
-    source: str
+    source: str = Field(description="given, or default where the source did not say")
 
 
 class SectorGridReply(BaseModel):
@@ -95,8 +95,13 @@ class SectorGridReply(BaseModel):
 class LimitsReply(BaseModel):
     probe_radius_m: float
     decal_radius_m: float
-    preview_width: int
+    preview_width: int = Field(description="pixels")
     probes_per_sector: int
+    body_bytes: int = Field(description="of what a write sends")
+    players: int = Field(description="of the live world, as are the next three")
+    lights: int
+    boxes: int
+    streams: int = Field(description="of players' volumes, all clients together")
 
 
 class OpeningReply(BaseModel):
@@ -123,9 +128,9 @@ class RoomReply(BaseModel):
 
 class WorldReply(BaseModel):
     name: str
-    bounds: BoundsReply
-    location: LocationReply
-    sectors: SectorGridReply
+    bounds: BoundsReply = Field(description="`minimum` and `maximum` of the geometry, world metres")
+    location: LocationReply = Field(description="latitude, longitude, elevation, time zone, compass azimuth of -Z, date of a bare HH:MM")
+    sectors: SectorGridReply = Field(description="how large sectors are, how many were baked, and the least and greatest x and z of them")
     weather: list[str] = Field(description="presets that `weather` may name")
     weather_overrides: dict[str, tuple[float, float]] = Field(description="numbers that `preset:name=value` may replace, and their ranges")
     time: str = Field(description="what `time` may be")
@@ -135,15 +140,15 @@ class WorldReply(BaseModel):
     kinds: list[str] = Field(description="what `kind` of a volume may be: outdoor, fog, and where there are rooms interior")
     cascades: list[int] = Field(description="what `cascade` of a volume may be: -1 where fine voxels were baked")
     distant: list[str] = Field(description="what `light` of the distant texture may be, the default last")
-    rooms: list[RoomReply]
-    limits: LimitsReply
+    rooms: list[RoomReply] = Field(description="their boxes in world metres, and the openings of each")
+    limits: LimitsReply = Field(description="of what may be asked for")
     dataset: dict[str, Any] = Field(description="digest, preset, basis, settings, counts and error report of the bake")
 
 
 class SectorReply(BaseModel):
-    sector: tuple[int, int]
+    sector: tuple[int, int] = Field(description="x, z: it covers [64 x, 64 x + 64) by [64 z, 64 z + 64) m")
     bytes: int
-    digest: str
+    digest: str = Field(description="BLAKE2b, 16 bytes, of the file; its ETag")
     probes: int
     href: str
 

@@ -1,10 +1,11 @@
 """What routes work with: one dataset, one engine, and the limits that keep the work bounded."""
 
+import asyncio
 import logging
 import secrets
 import threading
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import AsyncIterator, Iterable, Iterator
+from contextlib import asynccontextmanager, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,11 +24,14 @@ from server.tick_signal import TickSignal
 
 log = logging.getLogger("sectorlight.service")
 
+PREVIEW_THREADS = 2  # one draws while another finds its light, or that its client has the picture
+
 
 class Service:
     """Shared by all requests of a process.
 
-    Routes run on a pool of threads. The engine lights for one of them at a time, and pictures, the only other heavy work, take turns.
+    Routes run on a pool of threads. The engine lights for one of them at a time, and pictures, the only other heavy work, take turns at
+    two of them.
     Waiting threads hold no arrays, so memory does not grow with the queue. The live world has a thread and a queue of its own.
     """
 
@@ -43,6 +47,7 @@ class Service:
         self.player_volumes = PlayerVolumes()
         self.replies = FinishedReplies()
         self.preview_scenes = PreviewScenes(dataset)
+        self._preview_threads = asyncio.Semaphore(PREVIEW_THREADS)
         self._preview_lock = threading.Lock()
         self._misfits = misfits(dataset, dataset.world.sectors)
         for reason in self._misfits.values():
@@ -58,6 +63,12 @@ class Service:
     def close(self) -> None:
         """Stop the threads that encode."""
         self.streams.stop_encoding()
+
+    @asynccontextmanager
+    async def preview_thread(self) -> AsyncIterator[None]:
+        """The right to take a thread for a picture: whoever waits for it holds none, so that pictures do not take those of all else."""
+        async with self._preview_threads:
+            yield
 
     @contextmanager
     def preview_turn(self) -> Iterator[None]:

@@ -16,7 +16,7 @@ MAX_BODY_BYTES = 1 << 20  # a path of 10 000 points, with room
 _bearer = HTTPBearer(auto_error=False, description="the text of the server's --token-file; servers without one take every write")
 
 
-def require_token(service: ServiceDep, given: Annotated[HTTPAuthorizationCredentials | None, Security(_bearer)]) -> None:
+async def require_token(service: ServiceDep, given: Annotated[HTTPAuthorizationCredentials | None, Security(_bearer)]) -> None:
     """Raises TokenError for a write that does not bring the token."""
     if service.token is None:
         return

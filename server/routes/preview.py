@@ -3,7 +3,9 @@
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
+from fastapi.concurrency import run_in_threadpool
 
+from gi_core.errors import InputError
 from gi_core.lighting import Lighting
 from server import preview_views, tonemap
 from server.caching import Body, conditional, strong_etag
@@ -19,7 +21,7 @@ router = APIRouter(prefix="/v1", tags=["pictures"])
 
 
 @router.get("/preview.png", response_class=Response, responses=reply("image/png", headers=("ETag",), more=NOT_CHANGED))
-def preview(request: Request, service: ServiceDep, query: Annotated[PreviewQuery, Query()]) -> Response:
+async def preview(request: Request, service: ServiceDep, query: Annotated[PreviewQuery, Query()]) -> Response:
     """The city at a time and in a weather, lit directly by sun, moon and lamps, indirectly by the volumes that /v1/volume serves.
 
     `gi=off`: direct light only; `split`: left off, right on; `error`: the indirect light's error against a path tracer in false colour
@@ -36,6 +38,13 @@ def preview(request: Request, service: ServiceDep, query: Annotated[PreviewQuery
     of the one in front of each surface); `probes` within 60 m of the eye as spheres that show their light, or the colours of their
     `rooms`.
     """
+    async with service.preview_thread():
+        if await request.is_disconnected():  # a picture takes seconds: not for nobody
+            raise InputError("preview: expected a client that waits for its turn, found one that went away")
+        return await run_in_threadpool(_reply, request, service, query)
+
+
+def _reply(request: Request, service: Service, query: PreviewQuery) -> Response:
     light = service.lighting(query.time, query.weather)
     # The far view gets better when the same bake is run again, and nothing else of the dataset changes.
     identity = service.light_identity, service.dataset.distant_bytes

@@ -13,7 +13,11 @@ from gi_core.world import Room
 from server.caching import Body, conditional, strong_etag
 from server.dependencies import MAX_CASCADE, MAX_DECAL_RADIUS_M, MAX_PREVIEW_WIDTH, MAX_PROBE_RADIUS_M, NoQuery, ServiceDep
 from server.encoding import REPLY_VERSION
+from server.live_state import MAX_BOXES, MAX_LAMPS
 from server.models import BoundsReply, DoorReply, LimitsReply, LocationReply, OpeningReply, RoomReply, SectorGridReply, WorldReply, vector3
+from server.player_streams import MAX_CLIENTS
+from server.players import MAX_PLAYERS
+from server.write_access import MAX_BODY_BYTES
 
 router = APIRouter(prefix="/v1", tags=["dataset"])
 
@@ -61,6 +65,11 @@ def world_reply(dataset: Dataset) -> WorldReply:
             decal_radius_m=MAX_DECAL_RADIUS_M,
             preview_width=MAX_PREVIEW_WIDTH,
             probes_per_sector=MAX_PROBES_PER_SECTOR,
+            body_bytes=MAX_BODY_BYTES,
+            players=MAX_PLAYERS,
+            lights=MAX_LAMPS,
+            boxes=MAX_BOXES,
+            streams=MAX_CLIENTS,
         ),
         dataset={
             "digest": dataset.digest,

@@ -48,17 +48,26 @@ function showClock(clock) {
 
 function showPlayers(players) {
   if (!players.some((player) => player.id === followed)) followed = null;
-  at("live-players").replaceChildren(...players.map((player) => {
-    const row = document.createElement("li"), follow = document.createElement("button"), gone = document.createElement("button");
-    follow.type = gone.type = "button";
+  const list = at("live-players"), shown = JSON.stringify(players.map((player) => player.id));
+  // Made anew only when somebody comes or goes: buttons that are replaced twice a second lose the keyboard's focus, and clicks.
+  if (list.dataset.shown !== shown) list.replaceChildren(...players.map(({ id }) => playerRow(id)));
+  list.dataset.shown = shown;
+  players.forEach((player, i) => {
+    const [follow, place] = list.children[i].children;
     follow.textContent = `${player.id === followed ? "following" : "follow"} ${player.id}`;
     follow.setAttribute("aria-pressed", String(player.id === followed));
-    follow.addEventListener("click", () => { followed = player.id === followed ? null : player.id; });
-    gone.textContent = "remove";
-    gone.addEventListener("click", () => tell("DELETE", `players/${encodeURIComponent(player.id)}`));
-    row.append(follow, ` ${player.position.map((v) => v.toFixed(1)).join(", ")} m `, gone);
-    return row;
-  }));
+    place.textContent = ` ${player.position.map((v) => v.toFixed(1)).join(", ")} m `;
+  });
+}
+
+function playerRow(id) {
+  const row = document.createElement("li"), follow = document.createElement("button"), gone = document.createElement("button");
+  follow.type = gone.type = "button";
+  follow.addEventListener("click", () => { followed = id === followed ? null : id; });
+  gone.textContent = "remove";
+  gone.addEventListener("click", () => tell("DELETE", `players/${encodeURIComponent(id)}`));
+  row.append(follow, document.createElement("span"), gone);
+  return row;
 }
 
 // The picture's own controls take the world's moment and the player's place.

@@ -241,7 +241,22 @@ def test_a_full_disk_ends_with_one_line_and_status_1(source, tmp_path):
     last = errors.strip().splitlines()[-1]
     assert last.startswith("sectorlight: ")
     assert "File too large" in last
+    assert "--output" in last
     assert not [name for name in files(tmp_path) if "partial" in name]
+
+
+def test_no_room_for_what_workers_share_names_the_folder_that_it_would_be_in(source, tmp_path):
+    def no_file():
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))
+
+    process = command(source, tmp_path / "out", "--quality=draft", "--jobs=1", preexec_fn=no_file)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 1
+    last = errors.strip().splitlines()[-1]
+    assert "scene.npz: File too large" in last
+    assert "set TMPDIR" in last
+    assert "--output" not in last
 
 
 @pytest.fixture(scope="module")

@@ -24,6 +24,7 @@ NEW_YORK = Location()
         ("2024-02-29T23:59:59", "2024-02-29T23:59:59-05:00"),
         ("2024-12-21T18:00Z", "2024-12-21T13:00:00-05:00"),
         ("2024-12-21T18:00+09:00", "2024-12-21T04:00:00-05:00"),
+        ("2024-12-21 18:00 09:00", "2024-12-21T04:00:00-05:00"),  # of a URL that was not encoded
         # 02:30 does not exist on this day: clocks went from 02:00 to 03:00.
         ("2024-03-10T02:30", "2024-03-10T03:30:00-04:00"),
         # 01:30 came twice: the first one, unless an offset says otherwise.
@@ -47,6 +48,8 @@ def test_time_is_read_in_the_locations_zone(text: str, expected: str) -> None:
         "",
         "noon",
         " 13:00",
+        "13:00 09:00",
+        "2024-06-21 13:00 9:00",
         "13:00Z",
         "2023-02-29T12:00",
         "2024-06-21",

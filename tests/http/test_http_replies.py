@@ -16,6 +16,8 @@ from PIL import Image
 from gi_core import distant_file
 from gi_core.constants import VOLUME_SHAPE, VOXEL_SIZE_M
 from server.app import create_app
+from server.live_state import MAX_BOXES, MAX_LAMPS
+from server.players import MAX_PLAYERS
 from server.settings import Settings
 
 LIGHTS = {"": {}, "sky": {"light": "sky"}, "full": {"light": "full"}}
@@ -55,7 +57,9 @@ def test_the_viewer_has_its_files(http: httpx.Client) -> None:
     page = http.get("/")
     for name in ("viewer.js", "viewer.css"):
         assert f'"viewer/{name}"' in page.text
-        assert http.get(f"/viewer/{name}").status_code == 200
+        file = http.get(f"/viewer/{name}")
+        assert (file.status_code, file.headers["cache-control"]) == (200, "no-cache")
+        assert http.get(f"/viewer/{name}", headers={"If-None-Match": file.headers["etag"]}).status_code == 304
 
 
 def test_the_world_says_what_may_be_asked(http: httpx.Client) -> None:
@@ -65,6 +69,10 @@ def test_the_world_says_what_may_be_asked(http: httpx.Client) -> None:
     assert world["sectors"]["count"] == len(http.get("/v1/sectors").json()["sectors"]) > 0
     assert world["sectors"]["size_m"] == 64
     assert world["dataset"]["digest"] == http.get("/readyz").json()["dataset"]
+    limits = world["limits"]
+    assert (limits["players"], limits["lights"], limits["boxes"]) == (MAX_PLAYERS, MAX_LAMPS, MAX_BOXES)
+    too_long = http.put("/v1/clock", content=b" " * (limits["body_bytes"] + 1), headers={"Content-Type": "application/json"})
+    assert too_long.status_code == 413
 
 
 def test_every_weather_that_the_world_lists_gives_light(http: httpx.Client) -> None:
