@@ -16,6 +16,7 @@ KNOB_CHOICES: dict[str, tuple[str, ...]] = {
     "sky": SKY_SCHEMES,
     "placement": ("grid", "adaptive"),
     "voxel_weights": ("nearest", "fitted"),
+    "wall_weights": ("nearest", "fitted"),
 }
 # What a knob may be where it is not any length, angle or number of 0.01 to 10 000.
 KNOB_RANGES = {
@@ -59,6 +60,8 @@ class BakeSettings:
     feedback_probes : probes that light a surfel, the closest of those that see it; more: smoother bounces, more to do at each relight
     placement : "grid", ground grid and walls; "adaptive", where light changes (bake_jobs/adaptive.py)
     voxel_weights : "nearest", visible probes by distance; "fitted", to trial light (bake_jobs/fit.py)
+    wall_weights : of voxels in walls, "nearest", those of the nearest air; "fitted", to what surfaces that read them need, where voxel
+        weights are fitted too (bake_jobs/surface_fit.py)
     trial_rays_per_face_edge : of the trial light at every voxel; more: less noise in what placement and weights follow
     probe_worth : adaptive placement goes on until a probe takes less than this off the squared relative errors of the voxels that see it,
         summed; less: more probes
@@ -91,6 +94,7 @@ class BakeSettings:
     feedback_probes: int = 1
     placement: str = "grid"
     voxel_weights: str = "nearest"
+    wall_weights: str = "nearest"
     trial_rays_per_face_edge: int = 8
     probe_worth: float = 0.01
     probe_budget: int = 1000
@@ -111,6 +115,8 @@ class BakeSettings:
             del knobs["sky_patches"]
         if self.voxel_levels == 1:
             del knobs["voxel_levels"]
+        if self.wall_weights == "nearest":
+            del knobs["wall_weights"]
         return knobs
 
 
@@ -139,7 +145,13 @@ def with_knobs(settings: BakeSettings, knobs: Sequence[str]) -> BakeSettings:
 
 
 # What placement="adaptive" and voxel_weights="fitted" want of the other knobs: both tuned together (gi_core/MATH.md).
-ADAPTIVE: dict[str, Any] = {"placement": "adaptive", "voxel_weights": "fitted", "voxel_candidates": 24, "margin_m": 3.2}
+ADAPTIVE: dict[str, Any] = {
+    "placement": "adaptive",
+    "voxel_weights": "fitted",
+    "wall_weights": "fitted",
+    "voxel_candidates": 24,
+    "margin_m": 3.2,
+}
 
 
 def with_target_error(settings: BakeSettings, target_error: float) -> BakeSettings:
