@@ -115,7 +115,7 @@ class BakeSettings:
             del knobs["sky_patches"]
         if self.voxel_levels == 1:
             del knobs["voxel_levels"]
-        if self.wall_weights == "nearest":
+        if "nearest" in (self.wall_weights, self.voxel_weights):
             del knobs["wall_weights"]
         return knobs
 
