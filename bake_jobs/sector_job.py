@@ -13,6 +13,7 @@ from bake_jobs.geometry_clip import SectorCutter
 from bake_jobs.inside import Solids
 from bake_jobs.path_tracer import PathTracer
 from bake_jobs.rays import RayScene
+from bake_jobs.reader_probes import add_probes
 from bake_jobs.scene import Scene
 from bake_jobs.served_error import ServedError
 from bake_jobs.surface_fit import SurfaceFit
@@ -190,7 +191,8 @@ class SectorBaker:
             return placement.place_probes(rays, solids, scene.bounds, index, settings, scene.rooms, scene.hints), None
         if settings.placement == "adaptive":
             search = self._search(index)
-            return self._first(search, search.probes() if settings.target_error else min(search.ranking.enough, settings.probe_budget))
+            found = self._first(search, search.probes() if settings.target_error else min(search.ranking.enough, settings.probe_budget))
+            return self._with_reader_probes(index, *found)
         air = find_air(rays, solids, scene.bounds, index, settings, scene.rooms)
         light = trial.light(air.centre)
         placed = placement.place_probes(rays, solids, scene.bounds, index, settings, scene.rooms, scene.hints)
@@ -209,6 +211,16 @@ class SectorBaker:
     def _first(self, search: TargetSearch, count: int) -> tuple[placement.Placement, adaptive.Trial | None]:
         placed, cube = search.ranking.first(count)
         return placed, search.trial(cube) if self._settings.voxel_weights == "fitted" else None
+
+    def _with_reader_probes(
+        self, index: SectorIndex, placed: placement.Placement, trial: adaptive.Trial | None
+    ) -> tuple[placement.Placement, adaptive.Trial | None]:
+        geometry = self.cutter.cut(index)
+        surface_fit = self._surface_fit(geometry, placed, trial)
+        if trial is None or surface_fit is None or self.trial is None or not self._settings.reader_probes:
+            return placed, trial
+        lit = self._trial_scene(READER_RAYS_PER_FACE_EDGE)
+        return add_probes(surface_fit, index, self._settings, placed, trial, lit, self.trial)
 
 
 def _surfaces(geometry: Geometry) -> Float64:

@@ -34,6 +34,8 @@ OTHER_FACES = 0.05
 LEAST_READ = 0.05
 # Nearest probes of a reader that are tested for visibility.
 CANDIDATES = 16
+# What a place counts as off by that sees no probe, and at most.
+UNSEEN = 1.5
 # Roberts' sequence in two dimensions: spread evenly over triangles, whatever number of points falls into each.
 _SPREAD = np.array([0.7548776662466927, 0.5698402909980532])
 _CORNERS = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)])
@@ -116,21 +118,44 @@ class SurfaceFit:
 
     def _readers(self, lattice: Int64, wanted: Bool, voxel_size_m: float) -> Readers:
         """Readers on both sides of the surface, where there is air outdoors and they read a wanted voxel."""
-        air = self._trial.air
-        in_band = air.centre[air.own & air.in_band, 1]
-        point, normal = _spread(self._geometry, COARSE_AREA_M2 if voxel_size_m == VOXEL_SIZE_M else FINE_AREA_M2)
-        low = point[:, 1] < in_band.max(initial=-np.inf)
-        point, normal = np.concatenate([point[low], point[low]]), np.concatenate([normal[low], -normal[low]])
+        point, normal = self.both_sides(COARSE_AREA_M2 if voxel_size_m == VOXEL_SIZE_M else FINE_AREA_M2)
         off = 0.25 * voxel_size_m
         voxel, reads = _mixed(point + off * normal, lattice, voxel_size_m)
         reads = reads * wanted[voxel]
         some = np.flatnonzero(reads.sum(axis=1) > LEAST_READ)
         point, normal, voxel, reads = point[some], normal[some], voxel[some], reads[some]
-        # Light is tried out where the client samples, or halfway to what stands closer.
-        free = self._ray_scene.closest(point + 2 * SURFACE_OFFSET_M * normal, normal).distance.astype(np.float64)
-        place = point + np.minimum(off, free / 2)[:, None] * normal
-        found = ~self._solids.contain(place) & (rooms_of(place, self._rooms) == ROOM_OUTDOORS)
+        place, found = self.in_air(point, normal, off)
         return Readers(place[found], normal[found], voxel[found], reads[found])
+
+    def both_sides(self, area_m2: float) -> tuple[Float64, Float64]:
+        """Points (n, 3) [m] on the surface below the band's top, one for so much area and side, and unit normals (n, 3)."""
+        air = self._trial.air
+        point, normal = _spread(self._geometry, area_m2)
+        low = point[:, 1] < air.centre[air.own & air.in_band, 1].max(initial=-np.inf)
+        return np.concatenate([point[low], point[low]]), np.concatenate([normal[low], -normal[low]])
+
+    def in_air(self, point: Float64, normal: Float64, off_m: float) -> tuple[Float64, Bool]:
+        """Places (n, 3) [m] off a surface, where a client samples or halfway to what stands closer; which (n,) are in air outdoors."""
+        free = self._ray_scene.closest(point + 2 * SURFACE_OFFSET_M * normal, normal).distance.astype(np.float64)
+        place = point + np.minimum(off_m, free / 2)[:, None] * normal
+        return place, ~self._solids.contain(place) & (rooms_of(place, self._rooms) == ROOM_OUTDOORS)
+
+    def unexplained(self, place: Float64, normal: Float64, light: Float32) -> Float64:
+        """(n,), 0 to UNSEEN: how far the best blend of probes is from light (n, S, 6) at each place, relative, along its normal."""
+        number, outdoors = np.arange(len(place)), np.flatnonzero(self._placement.room == ROOM_OUTDOORS)
+        if not len(outdoors) or not len(place):
+            return np.full(len(place), UNSEEN)
+        probe, closeness = self._candidates(place, number, np.ones(len(place)), number, len(place), outdoors)
+        sees = closeness.any(axis=1)
+        facing = np.maximum(normal @ FACE_DIRECTIONS.T, 0) ** 2
+        error = np.full(len(place), UNSEEN)
+        fitted = self._trial.states.fitted
+        weight = self._weights(light[sees], facing[sees] + OTHER_FACES, probe[sees], closeness[sees])
+        blend = np.einsum("nc,ncsf->nsf", weight, self._trial.probe_cube[probe[sees]])
+        served, exact = (np.einsum("nsf,nf->ns", a[:, fitted], facing[sees]) for a in (blend, light[sees]))
+        relative = np.abs(served - exact) / np.maximum(exact, 0.02 * exact.mean(axis=0) + 1e-9)
+        error[sees] = np.minimum(relative, UNSEEN).mean(axis=1)
+        return error
 
     def _candidates(self, place: Float64, reader: Int64, share: Float64, of: Int64, count: int, outdoors: Int64) -> tuple[Int64, Float64]:
         """Probes (count, c) that the readers of each voxel see, and how close (count, c) they are to those; 0 where there is none."""

@@ -22,7 +22,9 @@ def test_standard_is_the_talk_and_its_ideas():
 
 
 def test_reference_is_standard_and_more_of_it():
-    more = with_knobs(settings_for("standard"), ["cells_double_beyond_m=8", "probe_worth=0.001", "voxel_levels=2"]).to_json()
+    more = with_knobs(
+        settings_for("standard"), ["cells_double_beyond_m=8", "probe_worth=0.001", "voxel_levels=2", "reader_probes=150"]
+    ).to_json()
     assert settings_for("reference").to_json() | {"preset": ""} == more | {"preset": ""}
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from bake_jobs.config import ADAPTIVE, settings_for
+from bake_jobs.reader_probes import APART_M, worst_places
 from bake_jobs.sector_job import SectorBaker
 from bake_jobs.surface_fit import _mixed, _spread
 from gi_core.basis import evaluate
@@ -69,9 +70,9 @@ def yards(build):
     return houses.scene()
 
 
-def baked(scene, wall_weights):
+def baked(scene, wall_weights, **settings):
     suns = SUNS / np.linalg.norm(SUNS, axis=1, keepdims=True)
-    knobs = {**ADAPTIVE, "rays_per_face_edge": 4, "trial_rays_per_face_edge": 6, "wall_weights": wall_weights}
+    knobs = {**ADAPTIVE, "rays_per_face_edge": 4, "trial_rays_per_face_edge": 6, "wall_weights": wall_weights, **settings}
     bench = SectorBaker(scene, replace(settings_for("talk"), **knobs), suns, "test")
     geometry = bench.cutter.cut(HERE)
     return bench, geometry, bench.bake_arrays(HERE, geometry)[0]
@@ -109,3 +110,28 @@ def test_only_voxels_without_light_of_their_own_change(yards):
     assert changed.any()
     assert (near.voxel_class[changed] == VOXEL_SOLID).all()
     assert (near.probe_position == fitted.probe_position).all()
+
+
+def test_the_worst_place_gets_the_first_probe_and_its_neighbours_none():
+    """A row of places a metre apart, wrong around x = 3 and more so around x = 20, and one alone that no probe may stand at."""
+    place = np.stack([np.arange(40.0), np.zeros(40), np.zeros(40)], axis=1)
+    error = np.zeros(40)
+    error[2:5], error[19:22], error[35] = (0.1, 0.3, 0.1), (0.1, 1.0, 0.1), 1.5
+    may = np.abs(place[:, 0] - 35) > 3
+    assert place[worst_places(place, error, may, 10), 0].tolist() == [20.0, 3.0]
+    assert place[worst_places(place, error, may, 1), 0].tolist() == [20.0]
+    assert not len(worst_places(place, np.full(40, 0.05), may, 10))
+    everywhere = worst_places(place, np.full(40, 1.0), np.ones(40, bool), 40)
+    assert np.diff(np.sort(place[everywhere, 0])).min() > APART_M
+
+
+@pytest.mark.slow
+def test_reader_probes_stand_in_air_within_the_margins(yards):
+    few, more = (baked(yards, "fitted", reader_probes=count)[2] for count in (0, 12))
+    old = {tuple(p) for p in few.probe_position.tolist()}
+    new = np.array([p for p in more.probe_position.tolist() if tuple(p) not in old])
+    assert len(old) + len(new) == more.probe_count
+    assert 0 < len(new) <= 12
+    assert ((new > 3.2) & (new < 60.8))[:, [0, 2]].all()
+    bench = SectorBaker(yards, settings_for("talk"), SUNS[:1], "test")
+    assert not bench._solids.contain(new + HERE.origin).any()
