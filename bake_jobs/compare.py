@@ -8,7 +8,7 @@
     floor    exact light in place of the volume's, sampled alike   the same
 
 ``floor`` is what basis and voxel size cost when transport and interpolation are perfect: exact light at all open-air voxels, each
-other voxel filled from the nearest of them, as the server fills its solid ones.
+other voxel filled from the nearest of them. Voxels in walls that are fitted to their readers (wall_weights=fitted) can be better than that.
 
 All is in the dataset's basis: of harmonics, what they say of the six faces is compared with what exact harmonics would say. Their
 dataset has two stages more, ``shaded_cube`` and ``floor_cube``: the same points when the cube is served instead.
@@ -201,7 +201,7 @@ def compare_dataset(
         "open_air_called_solid": air["called_solid"] / max(air["open"], 1),
         # Sectors and states with a value of exactly zero where the reference is lit by day, or one that is no number.
         "dark_by_day": dark,
-        "floor_fill": "voxels outside open air are filled from the nearest voxel in it, as the server does",
+        "floor_fill": "voxels outside open air are filled from the nearest voxel in it",
     }
 
 

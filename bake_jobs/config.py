@@ -16,6 +16,7 @@ KNOB_CHOICES: dict[str, tuple[str, ...]] = {
     "sky": SKY_SCHEMES,
     "placement": ("grid", "adaptive"),
     "voxel_weights": ("nearest", "fitted"),
+    "wall_weights": ("nearest", "fitted"),
 }
 # What a knob may be where it is not any length, angle or number of 0.01 to 10 000.
 KNOB_RANGES = {
@@ -25,6 +26,7 @@ KNOB_RANGES = {
     "voxel_candidates": (1, 256),
     "rays_per_face_edge": (2, 256),
     "voxel_levels": (1, 2),
+    "reader_probes": (0, 1000),
     "probe_worth": (1e-5, 1e4),
     "fit_ridge": (1e-6, 1e4),
     "target_error": (1e-3, 1.0),
@@ -59,6 +61,10 @@ class BakeSettings:
     feedback_probes : probes that light a surfel, the closest of those that see it; more: smoother bounces, more to do at each relight
     placement : "grid", ground grid and walls; "adaptive", where light changes (bake_jobs/adaptive.py)
     voxel_weights : "nearest", visible probes by distance; "fitted", to trial light (bake_jobs/fit.py)
+    wall_weights : of voxels in walls, "nearest", those of the nearest air; "fitted", to what surfaces that read them need, where voxel
+        weights are fitted too (bake_jobs/surface_fit.py)
+    reader_probes : with fitted wall weights, probes of a sector at most that stand where surfaces are lit as no blend of the others is, in
+        light wells and between walls (bake_jobs/reader_probes.py); more: better lit walls there
     trial_rays_per_face_edge : of the trial light at every voxel; more: less noise in what placement and weights follow
     probe_worth : adaptive placement goes on until a probe takes less than this off the squared relative errors of the voxels that see it,
         summed; less: more probes
@@ -91,6 +97,8 @@ class BakeSettings:
     feedback_probes: int = 1
     placement: str = "grid"
     voxel_weights: str = "nearest"
+    wall_weights: str = "nearest"
+    reader_probes: int = 0
     trial_rays_per_face_edge: int = 8
     probe_worth: float = 0.01
     probe_budget: int = 1000
@@ -111,6 +119,10 @@ class BakeSettings:
             del knobs["sky_patches"]
         if self.voxel_levels == 1:
             del knobs["voxel_levels"]
+        if "nearest" in (self.wall_weights, self.voxel_weights):
+            del knobs["wall_weights"]
+        if not self.reader_probes:
+            del knobs["reader_probes"]
         return knobs
 
 
@@ -139,7 +151,13 @@ def with_knobs(settings: BakeSettings, knobs: Sequence[str]) -> BakeSettings:
 
 
 # What placement="adaptive" and voxel_weights="fitted" want of the other knobs: both tuned together (gi_core/MATH.md).
-ADAPTIVE: dict[str, Any] = {"placement": "adaptive", "voxel_weights": "fitted", "voxel_candidates": 24, "margin_m": 3.2}
+ADAPTIVE: dict[str, Any] = {
+    "placement": "adaptive",
+    "voxel_weights": "fitted",
+    "wall_weights": "fitted",
+    "voxel_candidates": 24,
+    "margin_m": 3.2,
+}
 
 
 def with_target_error(settings: BakeSettings, target_error: float) -> BakeSettings:
@@ -168,5 +186,6 @@ def settings_for(preset: str) -> BakeSettings:
         # Cells that double from 4 m on: a fifth fewer bytes and a quarter off a tick, for no error that `tradeoff` can tell.
         return BakeSettings(preset="standard", basis="sh2", sky="patches", sky_patches=96, cells_double_beyond_m=4.0, **ADAPTIVE)
     if preset == "reference":
-        return BakeSettings(preset="reference", basis="sh2", sky="patches", sky_patches=96, probe_worth=0.001, voxel_levels=2, **ADAPTIVE)
+        more: dict[str, Any] = {"probe_worth": 0.001, "voxel_levels": 2, "reader_probes": 150}
+        return BakeSettings(preset="reference", basis="sh2", sky="patches", sky_patches=96, **more, **ADAPTIVE)
     raise InputError(f"quality {preset!r}: expected one of {', '.join(PRESETS)}")

@@ -12,6 +12,7 @@ from bake_jobs.config import BakeSettings
 from bake_jobs.inside import Solids
 from bake_jobs.placement import Placement
 from bake_jobs.rays import RayScene
+from bake_jobs.surface_fit import SurfaceFit
 from bake_jobs.trial_fit import TrialFit
 from bake_jobs.trial_light import TrialScene
 from bake_jobs.voxel_classes import FILL_MARGIN, solid_voxels
@@ -41,9 +42,10 @@ def bake_fine_voxels(
     rooms: tuple[Room, ...],
     trial: Trial | None,
     trial_scene: TrialScene | None,
+    surface_fit: SurfaceFit | None = None,
 ) -> VoxelGrid:
     """Fine voxels of a sector. ``surfaces`` (2,) [m] are the lowest and highest surface in it; weights are fitted to trial light where
-    there is any."""
+    there is any, and those of voxels in walls by ``surface_fit``."""
     in_band = None if trial is None else trial.air.centre[trial.air.own & trial.air.in_band, 1]
     top = surfaces[0] + settings.band_m if in_band is None or not len(in_band) else float(in_band.max())
     lattice, shape = sector_lattice(index, float(surfaces[0]), min(top, float(surfaces[1]) + NEAR_SURFACE_M), FINE_VOXEL_SIZE_M)
@@ -72,6 +74,9 @@ def bake_fine_voxels(
     source, away = nearest_lit(lit, shape)
     lacks &= away <= SOLID_REACH_VOXELS
     probe[lacks], weight[lacks] = probe[source[lacks]], weight[source[lacks]]
+    if surface_fit is not None:
+        read = surface_fit.fit(lattice, lacks & (room == ROOM_OUTDOORS), FINE_VOXEL_SIZE_M)
+        probe[read.voxel], weight[read.voxel] = read.probe, read.weight
     inner = (slice(None), slice(FILL_MARGIN, -FILL_MARGIN), slice(FILL_MARGIN, -FILL_MARGIN))
     k = settings.voxel_probes
     return VoxelGrid(
@@ -98,4 +103,4 @@ def _trial_at(
     (x0, x1), (z0, z1) = (voxel_columns(i, FINE_VOXEL_SIZE_M) for i in index)
     own = (at[:, 0] >= x0) & (at[:, 0] < x1) & (at[:, 2] >= z0) & (at[:, 2] < z1)
     air = Air(at, centre[near], np.zeros(len(near)), room[near], np.ones(len(near), bool), own)
-    return Trial(trial.states, air, trial_scene.light(centre[near]), trial.probe_cube)
+    return Trial(trial.states, air, trial_scene.light(centre[near], trial.light.cells), trial.probe_cube)

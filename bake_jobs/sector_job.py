@@ -13,8 +13,10 @@ from bake_jobs.geometry_clip import SectorCutter
 from bake_jobs.inside import Solids
 from bake_jobs.path_tracer import PathTracer
 from bake_jobs.rays import RayScene
+from bake_jobs.reader_probes import add_probes
 from bake_jobs.scene import Scene
 from bake_jobs.served_error import ServedError
+from bake_jobs.surface_fit import SurfaceFit
 from bake_jobs.target_error import TargetSearch
 from bake_jobs.trial_light import TrialScene
 from bake_jobs.trial_states import trial_states
@@ -29,6 +31,8 @@ from gi_core.sun_table import SunTable
 
 # What probes err by themselves changes a little with their number: it is measured so many times at most.
 BAKES_FOR_TARGET = 3
+# Several readers share a voxel, so few rays do for one. Of an odd number one would run level, and see neither sky nor ground.
+READER_RAYS_PER_FACE_EDGE = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +65,8 @@ class SectorBaker:
         self.cutter = SectorCutter(scene)
         self.transfers = TransferBaker(scene, sun_directions, settings.sky_sources, self.rays)
         self._pattern = gbuffer.cube_map_pattern(settings.rays_per_face_edge, settings.basis)
-        self.trial = self._trial_scene() if settings.placement == "adaptive" or settings.voxel_weights == "fitted" else None
+        tries = settings.placement == "adaptive" or settings.voxel_weights == "fitted"
+        self.trial = self._trial_scene(settings.trial_rays_per_face_edge) if tries else None
         self._served_error = self._judge() if settings.target_error and settings.placement == "adaptive" else None
 
     def bake(self, index: SectorIndex) -> BakedSector:
@@ -72,7 +77,8 @@ class SectorBaker:
         fine = None
         if self._settings.voxel_levels > 1:
             rooms, around = self._scene.rooms, (self.rays, self._solids, _surfaces(geometry), index)
-            found = fine_voxels.bake_fine_voxels(*around, placed, self._settings, rooms, trial, self.trial)
+            surface_fit = self._surface_fit(geometry, placed, trial)
+            found = fine_voxels.bake_fine_voxels(*around, placed, self._settings, rooms, trial, self.trial, surface_fit)
             fine = fine_file.encode(index, found, self._bake_id)
         # From the file's bytes: so a transfer that is found later, from a finished sector, is the same.
         transfer = self.transfers.transfer(sector_file.decode(sector_bytes, f"sector {index}")[0])
@@ -113,7 +119,8 @@ class SectorBaker:
         clustered = surfels.cluster(seen, room, index.origin, scene.albedo, scene.emission, settings.cells_double_beyond_m)
         weights = factors.gather(seen, self._pattern, clustered, None if settings.sky == "faces" else settings.sky_patches)
         feedback_probe, feedback_weight = surfels.feedback(clustered, seen, settings.feedback_probes)
-        lattice = voxels.bake_voxels(rays, self._solids, _surfaces(geometry), index, placed, settings, scene.rooms, trial)
+        surface_fit = self._surface_fit(geometry, placed, trial)
+        lattice = voxels.bake_voxels(rays, self._solids, _surfaces(geometry), index, placed, settings, scene.rooms, trial, surface_fit)
         emits = bool(clustered.emission.any())
         codes = factor_weights.encode(weights.weight, weights.starts, weights.source >= len(clustered.brick_cell))
         sector = Sector(
@@ -159,10 +166,16 @@ class SectorBaker:
             meta["estimated_error"] = round(lattice.estimated_error, 5)
         return sector, meta
 
-    def _trial_scene(self) -> TrialScene:
+    def _trial_scene(self, edge: int) -> TrialScene:
         scene = self._scene
         states = trial_states(self._sun_directions, bool(scene.lamps) or bool(scene.emission.any()))
-        return TrialScene(self.rays, scene.albedo, scene.emission, scene.lamps, states, self._settings.trial_rays_per_face_edge)
+        return TrialScene(self.rays, scene.albedo, scene.emission, scene.lamps, states, edge)
+
+    def _surface_fit(self, geometry: Geometry, placed: placement.Placement, trial: adaptive.Trial | None) -> SurfaceFit | None:
+        if trial is None or self._settings.wall_weights != "fitted":
+            return None
+        around = (self.rays, self._solids, geometry, placed, self._settings, self._scene.rooms)
+        return SurfaceFit(*around, trial, self._trial_scene(READER_RAYS_PER_FACE_EDGE))
 
     def _judge(self) -> ServedError:
         scene, settings = self._scene, self._settings
@@ -178,7 +191,8 @@ class SectorBaker:
             return placement.place_probes(rays, solids, scene.bounds, index, settings, scene.rooms, scene.hints), None
         if settings.placement == "adaptive":
             search = self._search(index)
-            return self._first(search, search.probes() if settings.target_error else min(search.ranking.enough, settings.probe_budget))
+            found = self._first(search, search.probes() if settings.target_error else min(search.ranking.enough, settings.probe_budget))
+            return self._with_reader_probes(index, *found)
         air = find_air(rays, solids, scene.bounds, index, settings, scene.rooms)
         light = trial.light(air.centre)
         placed = placement.place_probes(rays, solids, scene.bounds, index, settings, scene.rooms, scene.hints)
@@ -197,6 +211,16 @@ class SectorBaker:
     def _first(self, search: TargetSearch, count: int) -> tuple[placement.Placement, adaptive.Trial | None]:
         placed, cube = search.ranking.first(count)
         return placed, search.trial(cube) if self._settings.voxel_weights == "fitted" else None
+
+    def _with_reader_probes(
+        self, index: SectorIndex, placed: placement.Placement, trial: adaptive.Trial | None
+    ) -> tuple[placement.Placement, adaptive.Trial | None]:
+        geometry = self.cutter.cut(index)
+        surface_fit = self._surface_fit(geometry, placed, trial)
+        if trial is None or surface_fit is None or self.trial is None or not self._settings.reader_probes:
+            return placed, trial
+        lit = self._trial_scene(READER_RAYS_PER_FACE_EDGE)
+        return add_probes(surface_fit, index, self._settings, placed, trial, lit, self.trial)
 
 
 def _surfaces(geometry: Geometry) -> Float64:

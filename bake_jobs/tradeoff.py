@@ -40,7 +40,7 @@ KNOBS: dict[str, tuple[str, ...]] = {
     "sky": ("sky=faces", "sky_patches=24", "sky_patches=48"),
     "feedback": ("feedback_probes=3",),
     "basis": ("basis=cube", "basis=sh1"),
-    "voxels": ("voxel_weights=nearest", "voxel_probes=2", "voxel_levels=2"),
+    "voxels": ("voxel_weights=nearest", "wall_weights=nearest", "voxel_probes=2", "voxel_levels=2"),
     "sun": ("sun_hour_step_degrees=7.5",),
 }
 TALK, IDEAS = "talk", "ideas"
@@ -51,6 +51,7 @@ IDEA_KNOBS: tuple[tuple[str, ...], ...] = (
     ("basis=sh2",),
     ("placement=adaptive", "margin_m=3.2"),
     ("voxel_weights=fitted", "voxel_candidates=24"),
+    ("voxel_weights=fitted", "voxel_candidates=24", "wall_weights=fitted"),
     ("feedback_probes=3",),
 )
 

@@ -39,13 +39,23 @@ _HALF = np.array([1 << (bits - 1) for bits in _BITS])
 
 
 @dataclass(frozen=True, eq=False)
+class Cells:
+    """Lit cells: key : (k,) int64, ascending, -1 for the sky; exitance : (k, S) float32, what each sends out in each state."""
+
+    key: Int64
+    exitance: Float32
+
+
+@dataclass(frozen=True, eq=False)
 class TrialLight:
     """cube : (n, S, 6) float32, irradiance of the six faces at each point in each state, luminance
     clearance : (n,) float32 [m], to the nearest surface that a ray met
+    cells : what was met
     """
 
     cube: Float32
     clearance: Float32
+    cells: Cells
 
 
 class TrialScene:
@@ -64,11 +74,21 @@ class TrialScene:
         self._sky = states.sky_radiance(self._pattern.direction)
         self._bounce = _cosine_directions(BOUNCE_RAYS)
 
-    def light(self, points: Float64) -> TrialLight:
-        """Light at points (n, 3) [m], world frame."""
+    def light(self, points: Float64, known: Cells | None = None) -> TrialLight:
+        """Light at points (n, 3) [m], world frame. ``known``: cells that were lit before, which need not be lit again."""
         keys, clearance = self._look(points)
-        cells, of_ray = distinct(keys.reshape(-1))
-        return TrialLight(self._gather(of_ray.reshape(keys.shape), keys < 0, self._exitance(cells)), clearance)
+        unique, of_ray = distinct(keys.reshape(-1))
+        cells = self._lit(unique, known)
+        return TrialLight(self._gather(of_ray.reshape(keys.shape), keys < 0, cells.exitance), clearance, cells)
+
+    def _lit(self, keys: Int64, known: Cells | None) -> Cells:
+        if known is None or not len(known.key):
+            return Cells(keys, self._exitance(keys))
+        at = np.minimum(np.searchsorted(known.key, keys), len(known.key) - 1)
+        exitance = known.exitance[at]
+        new = np.flatnonzero(known.key[at] != keys)
+        exitance[new] = self._exitance(keys[new])
+        return Cells(keys, exitance)
 
     def _look(self, points: Float64) -> tuple[Int64, Float32]:
         """Cell keys (n, r) of what each point's rays meet, -1 for the sky; and the distance (n,) of the nearest hit."""

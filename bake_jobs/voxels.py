@@ -4,7 +4,8 @@ A voxel in free air blends the closest probes that it sees. One that sees none o
 does that sees some: light does not end at a pillar, and trilinear sampling at a wall never turns dark. Indoors such a voxel takes the
 closest probe of its room instead, since the nearest air may be another's.
 
-Weights go by distance, or where light was tried out they are fitted to it (``voxel_weights="fitted"``).
+Weights go by distance, or where light was tried out they are fitted to it (``voxel_weights="fitted"``), and those of voxels in walls to
+what surfaces that read them need (``wall_weights="fitted"``).
 
 Towards a border a voxel gives up probes that the sector beyond does not hold: at the border line both sectors choose among the same.
 """
@@ -20,6 +21,7 @@ from bake_jobs.config import BakeSettings
 from bake_jobs.inside import Solids
 from bake_jobs.placement import Placement
 from bake_jobs.rays import SURFACE_OFFSET_M, RayScene
+from bake_jobs.surface_fit import SurfaceFit
 from bake_jobs.trial_fit import TrialFit
 from bake_jobs.voxel_classes import FILL_MARGIN, solid_voxels
 from gi_core.arrays import Bool, Float32, Float64, Int32, Int64, UInt8, UInt16
@@ -61,9 +63,10 @@ def bake_voxels(
     settings: BakeSettings,
     rooms: tuple[Room, ...],
     trial: Trial | None = None,
+    surface_fit: SurfaceFit | None = None,
 ) -> Voxels:
     """Voxels of a sector. ``surfaces`` (2,) [m] are the lowest and highest surface in it; weights are fitted to ``trial`` where it has
-    light, and go by distance elsewhere."""
+    light, and go by distance elsewhere. Voxels without light of their own are fitted by ``surface_fit`` where surfaces read them."""
     top = max(float(surfaces[1]) + AIR_ABOVE_TOP_M, float(surfaces[0]) + AIR_ABOVE_GROUND_M)
     lattice, shape = sector_lattice(index, float(surfaces[0]), top, VOXEL_SIZE_M)
     centre = voxel_centre(lattice.reshape(-1, 3))
@@ -73,8 +76,12 @@ def bake_voxels(
     kind[(room == ROOM_OUTDOORS) & solid_voxels(ray_scene, solids, centre.reshape(*shape, 3)).reshape(-1)] = VOXEL_SOLID
     fit = None if trial is None else TrialFit(trial, lattice.reshape(-1, 3), settings)
     probe, weight, blind = blend(ray_scene, centre, kind, room, placement, settings, fit)
-    source, _ = nearest_lit((kind != VOXEL_SOLID) & ~(blind & (room == ROOM_OUTDOORS)), shape)
+    lit = (kind != VOXEL_SOLID) & ~(blind & (room == ROOM_OUTDOORS))
+    source, _ = nearest_lit(lit, shape)
     probe, weight = probe[source], weight[source]
+    if surface_fit is not None:
+        read = surface_fit.fit(lattice, ~lit, VOXEL_SIZE_M)
+        probe[read.voxel], weight[read.voxel] = read.probe, read.weight
 
     # The fill margin was only there to be read from.
     inner = (slice(None), slice(FILL_MARGIN, -FILL_MARGIN), slice(FILL_MARGIN, -FILL_MARGIN))

@@ -58,7 +58,7 @@ class Sector:
     voxel_class : (ny, nz, nx) uint8, VOXEL_SOLID, VOXEL_OUTDOORS or VOXEL_INDOORS
     voxel_room : (ny, nz, nx) uint16
     voxel_probe : (ny, nz, nx, K) uint16
-    voxel_weight : (ny, nz, nx, K) float32, sums to 1 at every voxel (solid ones blend what the nearest air blends), or to 0
+    voxel_weight : (ny, nz, nx, K) float32, sums to 1 at every voxel (solid ones: what the nearest air does, or surfaces need), or to 0
         everywhere when the sector has no probe
     """
 

@@ -16,13 +16,15 @@ def test_a_knob_changes_one_setting_and_the_name():
 
 
 def test_standard_is_the_talk_and_its_ideas():
-    placed = ["placement=adaptive", "voxel_weights=fitted", "voxel_candidates=24", "margin_m=3.2"]
+    placed = ["placement=adaptive", "voxel_weights=fitted", "wall_weights=fitted", "voxel_candidates=24", "margin_m=3.2"]
     ideas = with_knobs(settings_for("talk"), ["basis=sh2", "sky=patches", "sky_patches=96", "cells_double_beyond_m=4", *placed]).to_json()
     assert settings_for("standard").to_json() | {"preset": ""} == ideas | {"preset": ""}
 
 
 def test_reference_is_standard_and_more_of_it():
-    more = with_knobs(settings_for("standard"), ["cells_double_beyond_m=8", "probe_worth=0.001", "voxel_levels=2"]).to_json()
+    more = with_knobs(
+        settings_for("standard"), ["cells_double_beyond_m=8", "probe_worth=0.001", "voxel_levels=2", "reader_probes=150"]
+    ).to_json()
     assert settings_for("reference").to_json() | {"preset": ""} == more | {"preset": ""}
 
 
@@ -34,6 +36,7 @@ def test_reference_is_standard_and_more_of_it():
         ("sky=none", "expected faces or patches"),
         ("placement=random", "expected grid or adaptive"),
         ("voxel_weights=1", "expected nearest or fitted"),
+        ("wall_weights=none", "expected nearest or fitted"),
         ("sky_patches=2", "expected 4 to 1024"),
         ("feedback_probes=33", "expected 1 to 32"),
         ("voxel_levels=3", "expected 1 to 2"),
@@ -55,4 +58,5 @@ def test_a_knob_that_does_nothing_is_not_part_of_a_bake():
     assert settings_for("standard").to_json()["sky_patches"] == settings_for("standard").sky_sources
     assert settings_for("talk").sky_sources == 6
     assert "voxel_levels" not in settings_for("standard").to_json()
+    assert "wall_weights" not in settings_for("talk").to_json()
     assert {settings_for(name).preset for name in PRESETS} == set(PRESETS)
