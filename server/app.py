@@ -77,7 +77,9 @@ def app_of(service: Service) -> FastAPI:
         title="Sectorlight",
         version=program_version(),
         summary="Dynamic global illumination of a baked city, at any hour and weather",
-        description="Errors are `application/problem+json` with a stable `code`. World frame: metres, Y up, X east, Z south.",
+        description="Errors are `application/problem+json` with a stable `code`. World frame: metres, Y up, X east, Z south.\n\n"
+        "The WebSocket `/v1/players/{id}/stream` sends what changes in a player's volume, tick by tick; server/STREAM.md in the source "
+        "describes it byte by byte.",
         dependencies=[Depends(refuse_repeated_parameters)],
         redirect_slashes=False,
         docs_url=None,  # their pages load scripts from elsewhere
