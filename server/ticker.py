@@ -33,8 +33,8 @@ from server.tick_stats import TickStats
 
 log = logging.getLogger("sectorlight.ticker")
 
-# Of a tick's time; then volumes wait for the next. With 0.4 fifty players had 3 and 8 late ticks for each one, and 5 to 17 % more frames; with
-# 0.2 they had half the frames.
+# Of a tick's time; then volumes wait for the next. With 0.4 fifty players had three times as many late ticks and up to a sixth more frames,
+# with 0.2 half the frames.
 FILL_UNTIL = 0.3
 
 Listener = Callable[[TickReport], None]
