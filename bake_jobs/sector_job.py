@@ -1,6 +1,7 @@
 """One sector, baked: a pure function of scene, settings, seed and index. Any process gives the same bytes."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,8 @@ from gi_core.sun_table import SunTable
 
 # What probes err by themselves changes a little with their number: it is measured so many times at most.
 BAKES_FOR_TARGET = 3
+# Three rows of a city of 5 km, of some 50 kB each: a sector's surface is asked for by its eight neighbours too.
+CUT_KEPT = 256
 # Several readers share a voxel, so few rays do for one. Of an odd number one would run level, and see neither sky nor ground.
 READER_RAYS_PER_FACE_EDGE = 4
 
@@ -63,6 +66,7 @@ class SectorBaker:
         self.rays = RayScene(scene.vertices, scene.triangles)
         self._solids = Solids(scene.vertices, scene.triangles)
         self.cutter = SectorCutter(scene)
+        self._cut = lru_cache(maxsize=CUT_KEPT)(self.cutter.cut)
         self.transfers = TransferBaker(scene, sun_directions, settings.sky_sources, self.rays)
         self._pattern = gbuffer.cube_map_pattern(settings.rays_per_face_edge, settings.basis)
         tries = settings.placement == "adaptive" or settings.voxel_weights == "fitted"
@@ -71,13 +75,13 @@ class SectorBaker:
 
     def bake(self, index: SectorIndex) -> BakedSector:
         """All files of one sector."""
-        geometry = self.cutter.cut(index)
+        geometry = self._cut(index)
         placed, trial, sector, meta = self._bake(index, geometry)
         sector_bytes = sector_file.encode(sector, meta, self._settings.sky_sources)
         fine = None
         if self._settings.voxel_levels > 1:
             rooms, around = self._scene.rooms, (self.rays, self._solids, _surfaces(geometry), index)
-            surface_fit = self._surface_fit(geometry, placed, trial)
+            surface_fit = self._surface_fit(index, geometry, placed, trial)
             found = fine_voxels.bake_fine_voxels(*around, placed, self._settings, rooms, trial, self.trial, surface_fit)
             fine = fine_file.encode(index, found, self._bake_id)
         # From the file's bytes: so a transfer that is found later, from a finished sector, is the same.
@@ -119,7 +123,7 @@ class SectorBaker:
         clustered = surfels.cluster(seen, room, index.origin, scene.albedo, scene.emission, settings.cells_double_beyond_m)
         weights = factors.gather(seen, self._pattern, clustered, None if settings.sky == "faces" else settings.sky_patches)
         feedback_probe, feedback_weight = surfels.feedback(clustered, seen, settings.feedback_probes)
-        surface_fit = self._surface_fit(geometry, placed, trial)
+        surface_fit = self._surface_fit(index, geometry, placed, trial)
         lattice = voxels.bake_voxels(rays, self._solids, _surfaces(geometry), index, placed, settings, scene.rooms, trial, surface_fit)
         emits = bool(clustered.emission.any())
         codes = factor_weights.encode(weights.weight, weights.starts, weights.source >= len(clustered.brick_cell))
@@ -171,11 +175,15 @@ class SectorBaker:
         states = trial_states(self._sun_directions, bool(scene.lamps) or bool(scene.emission.any()))
         return TrialScene(self.rays, scene.albedo, scene.emission, scene.lamps, states, edge)
 
-    def _surface_fit(self, geometry: Geometry, placed: placement.Placement, trial: adaptive.Trial | None) -> SurfaceFit | None:
+    def _surface_fit(
+        self, index: SectorIndex, geometry: Geometry, placed: placement.Placement, trial: adaptive.Trial | None
+    ) -> SurfaceFit | None:
         if trial is None or self._settings.wall_weights != "fitted":
             return None
-        around = (self.rays, self._solids, geometry, placed, self._settings, self._scene.rooms)
-        return SurfaceFit(*around, trial, self._trial_scene(READER_RAYS_PER_FACE_EDGE))
+        steps = [(x, z) for z in (-1, 0, 1) for x in (-1, 0, 1) if (x, z) != (0, 0)]
+        around = [self._cut(SectorIndex(index.x + x, index.z + z)) for x, z in steps]
+        where = (self.rays, self._solids, geometry, around, placed, self._settings, self._scene.rooms)
+        return SurfaceFit(*where, trial, self._trial_scene(READER_RAYS_PER_FACE_EDGE))
 
     def _judge(self) -> ServedError:
         scene, settings = self._scene, self._settings
@@ -215,9 +223,10 @@ class SectorBaker:
     def _with_reader_probes(
         self, index: SectorIndex, placed: placement.Placement, trial: adaptive.Trial | None
     ) -> tuple[placement.Placement, adaptive.Trial | None]:
-        geometry = self.cutter.cut(index)
-        surface_fit = self._surface_fit(geometry, placed, trial)
-        if trial is None or surface_fit is None or self.trial is None or not self._settings.reader_probes:
+        if not self._settings.reader_probes:
+            return placed, trial
+        surface_fit = self._surface_fit(index, self._cut(index), placed, trial)
+        if trial is None or surface_fit is None or self.trial is None:
             return placed, trial
         lit = self._trial_scene(READER_RAYS_PER_FACE_EDGE)
         return add_probes(surface_fit, index, self._settings, placed, trial, lit, self.trial)

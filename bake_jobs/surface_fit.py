@@ -6,12 +6,14 @@ their light is tried out (bake_jobs/trial_light.py). A voxel blends the probes t
 how much it does.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from bake_jobs.adaptive import DARK, DARK_LAMPLIGHT_LX, Trial
+from bake_jobs.border_weights import kept_at_border
 from bake_jobs.config import BakeSettings
 from bake_jobs.distinct import distinct
 from bake_jobs.fit import fit_weights
@@ -24,6 +26,7 @@ from gi_core.ambient_cube import FACE_DIRECTIONS
 from gi_core.arrays import Bool, Float32, Float64, Int64, UInt16
 from gi_core.constants import ROOM_OUTDOORS, VOXEL_SIZE_M
 from gi_core.geometry_file import Geometry
+from gi_core.grid import voxel_centre
 from gi_core.rooms import rooms_of
 from gi_core.world import Room
 
@@ -73,14 +76,17 @@ class SurfaceFit:
         ray_scene: RayScene,
         solids: Solids,
         geometry: Geometry,
+        around: Sequence[Geometry],
         placement: Placement,
         settings: BakeSettings,
         rooms: tuple[Room, ...],
         trial: Trial,
         trial_scene: TrialScene,
     ) -> None:
-        """``geometry``: the sector's surface; ``trial_scene`` lights readers, a few rays do: several share a voxel."""
-        self._ray_scene, self._solids, self._geometry, self._rooms = ray_scene, solids, geometry, rooms
+        """``geometry``: the sector's surface; ``around``: its neighbours', parts of which read its voxels; ``trial_scene`` lights readers,
+        a few rays do: several share a voxel."""
+        self._ray_scene, self._solids, self._rooms = ray_scene, solids, rooms
+        self._geometry, self._around = geometry, around
         self._placement, self._settings, self._trial, self._trial_scene = placement, settings, trial, trial_scene
 
     def fit(self, lattice: Int64, wanted: Bool, voxel_size_m: float) -> Fitted:
@@ -106,7 +112,8 @@ class SurfaceFit:
         target = np.zeros((count, light.shape[1], 6))
         np.add.at(target, of, facing[:, None] * light[reader])
         target /= np.maximum(turned, 1e-12)[:, None]
-        probe, closeness = self._candidates(readers.place, reader, share, of, count, outdoors)
+        centre = voxel_centre(lattice.reshape(-1, 3)[voxel], voxel_size_m)
+        probe, closeness = self._candidates(readers.place, reader, share, of, centre, outdoors)
         good = np.flatnonzero((read > LEAST_READ) & (closeness.sum(axis=1) > 0))
         if not len(good):
             return nothing
@@ -119,7 +126,10 @@ class SurfaceFit:
 
     def _readers(self, lattice: Int64, wanted: Bool, voxel_size_m: float) -> Readers:
         """Readers on both sides of the surface, where there is air outdoors and they read a wanted voxel."""
-        point, normal = self.both_sides(COARSE_AREA_M2 if voxel_size_m == VOXEL_SIZE_M else FINE_AREA_M2)
+        area_m2 = COARSE_AREA_M2 if voxel_size_m == VOXEL_SIZE_M else FINE_AREA_M2
+        # Those beyond a border are the very ones of the sector there: both fit voxels beside it to the same.
+        sides = [self.both_sides(area_m2, geometry) for geometry in (self._geometry, *self._around)]
+        point, normal = (np.concatenate(parts) for parts in zip(*sides, strict=True))
         off = 0.25 * voxel_size_m
         voxel, reads = _mixed(point + off * normal, lattice, voxel_size_m)
         reads = reads * wanted[voxel]
@@ -128,10 +138,11 @@ class SurfaceFit:
         place, found = self.in_air(point, normal, off)
         return Readers(place[found], normal[found], voxel[found], reads[found])
 
-    def both_sides(self, area_m2: float) -> tuple[Float64, Float64]:
-        """Points (n, 3) [m] on the surface below the band's top, one for so much area and side, and unit normals (n, 3)."""
+    def both_sides(self, area_m2: float, geometry: Geometry | None = None) -> tuple[Float64, Float64]:
+        """Points (n, 3) [m] on a surface, the sector's own if none is given, below the band's top, one for so much area and side, and unit
+        normals (n, 3)."""
         air = self._trial.air
-        point, normal = _spread(self._geometry, area_m2)
+        point, normal = _spread(self._geometry if geometry is None else geometry, area_m2)
         low = point[:, 1] < air.centre[air.own & air.in_band, 1].max(initial=-np.inf)
         return np.concatenate([point[low], point[low]]), np.concatenate([normal[low], -normal[low]])
 
@@ -146,7 +157,7 @@ class SurfaceFit:
         number, outdoors = np.arange(len(place)), np.flatnonzero(self._placement.room == ROOM_OUTDOORS)
         if not len(outdoors) or not len(place):
             return np.full(len(place), UNSEEN)
-        probe, closeness = self._candidates(place, number, np.ones(len(place)), number, len(place), outdoors)
+        probe, closeness = self._candidates(place, number, np.ones(len(place)), number, place, outdoors)
         sees = closeness.any(axis=1)
         facing = np.maximum(normal @ FACE_DIRECTIONS.T, 0) ** 2
         error = np.full(len(place), UNSEEN)
@@ -158,9 +169,11 @@ class SurfaceFit:
         error[sees] = np.minimum(relative, UNSEEN).mean(axis=1)
         return error
 
-    def _candidates(self, place: Float64, reader: Int64, share: Float64, of: Int64, count: int, outdoors: Int64) -> tuple[Int64, Float64]:
-        """Probes (count, c) that the readers of each voxel see, and how close (count, c) they are to those; 0 where there is none."""
-        position, wanted = self._placement.position, self._settings.fit_candidates
+    def _candidates(
+        self, place: Float64, reader: Int64, share: Float64, of: Int64, centre: Float64, outdoors: Int64
+    ) -> tuple[Int64, Float64]:
+        """Probes (m, c) that the readers of voxels with centres (m, 3) [m] see, and how close (m, c) they are; 0 where there is none."""
+        position, wanted, count = self._placement.position, self._settings.fit_candidates, len(centre)
         tried = min(CANDIDATES, len(outdoors))
         distance, near = cKDTree(position[outdoors]).query(place, k=tried)
         distance, near = distance.reshape(-1, tried), outdoors[near.reshape(-1, tried)]
@@ -168,8 +181,9 @@ class SurfaceFit:
         hidden = self._ray_scene.occluded(np.repeat(place, tried, axis=0), way.reshape(-1, 3), distance.reshape(-1) - SURFACE_OFFSET_M)
         close = np.where(hidden.reshape(-1, tried), 0, 1 / np.maximum(distance, 0.25) ** 2)
         pair, of_pair = distinct((of[:, None] * len(position) + near[reader]).reshape(-1))
-        closeness = np.bincount(of_pair, (share[:, None] * close[reader]).reshape(-1), len(pair))
         voxel, probe = np.divmod(pair, len(position))
+        closeness = kept_at_border(centre[voxel], position[probe][:, None], self._settings.margin_m)[:, 0]
+        closeness *= np.bincount(of_pair, (share[:, None] * close[reader]).reshape(-1), len(pair))
         order = np.lexsort((probe, -closeness, voxel))
         voxel, probe, closeness = voxel[order], probe[order], closeness[order]
         rank = np.arange(len(voxel)) - np.searchsorted(voxel, voxel)

@@ -17,6 +17,7 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
 from bake_jobs.adaptive import Trial
+from bake_jobs.border_weights import FADE_M, kept_at_border, to_border
 from bake_jobs.config import BakeSettings
 from bake_jobs.inside import Solids
 from bake_jobs.placement import Placement
@@ -25,7 +26,7 @@ from bake_jobs.surface_fit import SurfaceFit
 from bake_jobs.trial_fit import TrialFit
 from bake_jobs.voxel_classes import FILL_MARGIN, solid_voxels
 from gi_core.arrays import Bool, Float32, Float64, Int32, Int64, UInt8, UInt16
-from gi_core.constants import ROOM_OUTDOORS, SECTOR_SIZE_M, VOXEL_INDOORS, VOXEL_OUTDOORS, VOXEL_SIZE_M, VOXEL_SOLID
+from gi_core.constants import ROOM_OUTDOORS, VOXEL_INDOORS, VOXEL_OUTDOORS, VOXEL_SIZE_M, VOXEL_SOLID
 from gi_core.grid import SectorIndex, voxel_centre, voxel_columns
 from gi_core.rooms import rooms_of
 from gi_core.world import Room
@@ -34,9 +35,7 @@ from gi_core.world import Room
 # stands in the street.
 AIR_ABOVE_TOP_M = 4.0
 AIR_ABOVE_GROUND_M = 28.0
-# Probes that the sector beyond a border does not hold fade out over the last two voxels before it, and have to be replaced by some that it
-# does, which may be farther away than the usual candidates.
-FADE_M = 2 * VOXEL_SIZE_M
+# What fades out at a border has to be replaced by probes that may be farther away than the usual candidates.
 CANDIDATES_AT_BORDER = 24
 
 
@@ -131,7 +130,7 @@ def blend(
         if len(members) == 0 or len(available) == 0:
             continue
         tree = cKDTree(placement.position[available])
-        at_border = _to_line(centre[members]).min(axis=1) < FADE_M
+        at_border = to_border(centre[members]).min(axis=1) < FADE_M
         for some, most in ((members[~at_border], settings.voxel_candidates), (members[at_border], CANDIDATES_AT_BORDER)):
             candidates = min(max(most, settings.voxel_candidates), len(available))
             distance, near = tree.query(centre[some], k=candidates)
@@ -140,7 +139,7 @@ def blend(
             blind_member = ~sees.any(axis=1)
             sees[blind_member, 0] = True
             blind[some] = blind_member
-            kept = _kept(centre[some], placement.position[near], settings.margin_m)
+            kept = kept_at_border(centre[some], placement.position[near], settings.margin_m)
             closeness = np.where(sees, kept / np.maximum(distance, 0.25) ** 2, 0)
             rows = np.arange(len(some))[:, None]
             share = np.zeros_like(closeness)
@@ -153,23 +152,6 @@ def blend(
             weight[some, : best.shape[1]] = share[rows, best] / share.sum(axis=1, keepdims=True)
     probe[weight == 0] = 0
     return probe, weight, blind
-
-
-def _to_line(position: Float64) -> Float64:
-    """(..., 2) [m]: how far positions (..., 3) [m] are from the nearest border line across x, and across z."""
-    place = position[..., [0, 2]] / SECTOR_SIZE_M
-    return np.asarray(np.abs(place - np.round(place)) * SECTOR_SIZE_M)
-
-
-def _kept(centre: Float64, probes: Float64, margin_m: float) -> Float64:
-    """(V, c), 0 to 1: what voxels (V, 3) keep of the weights of candidates (V, c, 3).
-
-    All of it where both sectors at a voxel's nearest border line hold the probe, otherwise a share that falls with the way to the line.
-    """
-    line = np.round(centre[:, [0, 2]] / SECTOR_SIZE_M) * SECTOR_SIZE_M
-    held_by_both = np.abs(probes[:, :, [0, 2]] - line[:, None]) < margin_m
-    share = np.minimum(_to_line(centre) / FADE_M, 1)[:, None]
-    return np.asarray(np.where(held_by_both, 1, share).prod(axis=2))
 
 
 def _visible(ray_scene: RayScene, centre: Float64, probes: Float64, distance: Float64) -> Bool:
