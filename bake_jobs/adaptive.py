@@ -19,7 +19,7 @@ from bake_jobs.choose import GAIN_STEP, Chooser, Pairs, neighbour_pairs
 from bake_jobs.config import BakeSettings
 from bake_jobs.distinct import distinct
 from bake_jobs.inside import Solids
-from bake_jobs.placement import OFF_EDGES_M, Placement, asked_positions, in_boxes
+from bake_jobs.placement import OFF_EDGES_M, Placement, asked_positions, in_boxes, stored_order
 from bake_jobs.rays import RayScene
 from bake_jobs.scene import ProbeHint
 from bake_jobs.trial_light import TrialLight, TrialScene
@@ -84,8 +84,7 @@ class Ranking:
         """The first ``count`` probes, and their trial light."""
         wanted = min(max(count, self.fixed), len(self.position))
         kept = np.arange(min(wanted, MAX_PROBES_PER_SECTOR))
-        # Stored along a curve of place, as the grid's are.
-        order = kept[np.lexsort((self.position[kept, 1], self.position[kept, 0] // 8, self.position[kept, 2] // 8))]
+        order = kept[stored_order(self.position[kept])]
         placed = Placement(self.position[order], self.flags[order], self.room[order], 0, wanted - len(kept))
         return placed, self.cube[order]
 

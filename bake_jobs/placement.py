@@ -12,7 +12,7 @@ from bake_jobs.config import BakeSettings
 from bake_jobs.inside import Solids
 from bake_jobs.rays import SURFACE_OFFSET_M, RayScene
 from bake_jobs.scene import ProbeHint
-from gi_core.arrays import Bool, Float64, UInt8, UInt16
+from gi_core.arrays import Bool, Float64, Int64, UInt8, UInt16
 from gi_core.constants import MAX_PROBES_PER_SECTOR, ROOM_OUTDOORS, SECTOR_SIZE_M
 from gi_core.grid import SectorIndex
 from gi_core.rooms import rooms_of
@@ -88,9 +88,13 @@ def place_probes(
     chosen = np.sort(order[:MAX_PROBES_PER_SECTOR])
     position, flags, room = position[chosen], flags[chosen], room[chosen]
     position = position + np.array(OFF_EDGES_M)
-    # Stored along a curve of place, so that neighbours in memory are neighbours in space: their factors compress and cache well.
-    order = np.lexsort((position[:, 1], position[:, 0] // 8, position[:, 2] // 8))
+    order = stored_order(position)
     return Placement(position[order], flags[order], room[order], dead_count, max(0, len(in_sector) - MAX_PROBES_PER_SECTOR))
+
+
+def stored_order(position: Float64) -> Int64:
+    """Along a curve of place, so that neighbours in memory are neighbours in space: their factors compress and cache well."""
+    return np.lexsort((position[:, 1], position[:, 0] // 8, position[:, 2] // 8))
 
 
 def _in_sector(position: Float64, index: SectorIndex, margin_m: float) -> Bool:

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from bake_jobs.adaptive import DARK, Trial
 from bake_jobs.config import BakeSettings
-from bake_jobs.placement import OFF_EDGES_M, Placement
+from bake_jobs.placement import OFF_EDGES_M, Placement, stored_order
 from bake_jobs.surface_fit import FINE_AREA_M2, SurfaceFit
 from bake_jobs.trial_light import TrialScene
 from gi_core.arrays import Bool, Float64, Int64
@@ -28,19 +28,13 @@ LEAST_ERROR = 0.5
 
 
 def add_probes(
-    surface_fit: SurfaceFit,
-    index: SectorIndex,
-    settings: BakeSettings,
-    placed: Placement,
-    trial: Trial,
-    reader_scene: TrialScene,
-    probe_scene: TrialScene,
+    surface_fit: SurfaceFit, index: SectorIndex, settings: BakeSettings, placed: Placement, trial: Trial, probe_scene: TrialScene
 ) -> tuple[Placement, Trial]:
-    """Placement and trial light with at most ``settings.reader_probes`` more. ``reader_scene`` lights places, ``probe_scene`` probes."""
+    """Placement and trial light with at most ``settings.reader_probes`` more, which ``probe_scene`` lights."""
     point, normal = surface_fit.both_sides(FINE_AREA_M2)
     place, found = surface_fit.in_air(point, normal, 0.5 * FINE_VOXEL_SIZE_M)
     place, normal = place[found], normal[found]
-    light = reader_scene.light(place, trial.light.cells).cube
+    light = surface_fit.light(place)
     error = surface_fit.unexplained(place, normal, light)
     error[light.max(axis=(1, 2)) < DARK] = 0
     local = place[:, [0, 2]] - index.origin[[0, 2]]
@@ -55,8 +49,7 @@ def add_probes(
     flags = np.concatenate([placed.flags, np.full(len(new), PROBE_ON_WALL, np.uint8)])
     rooms = np.concatenate([placed.room, np.full(len(new), ROOM_OUTDOORS, np.uint16)])
     cube = np.concatenate([trial.probe_cube, probe_scene.light(new, trial.light.cells).cube])
-    # Stored along a curve of place, as all are.
-    order = np.lexsort((position[:, 1], position[:, 0] // 8, position[:, 2] // 8))
+    order = stored_order(position)
     return Placement(position[order], flags[order], rooms[order], placed.dead, placed.dropped), replace(trial, probe_cube=cube[order])
 
 

@@ -71,6 +71,7 @@ class SectorBaker:
         self._pattern = gbuffer.cube_map_pattern(settings.rays_per_face_edge, settings.basis)
         tries = settings.placement == "adaptive" or settings.voxel_weights == "fitted"
         self.trial = self._trial_scene(settings.trial_rays_per_face_edge) if tries else None
+        self._readers = self._trial_scene(READER_RAYS_PER_FACE_EDGE) if settings.wall_weights == "fitted" else None
         self._served_error = self._judge() if settings.target_error and settings.placement == "adaptive" else None
 
     def bake(self, index: SectorIndex) -> BakedSector:
@@ -178,12 +179,12 @@ class SectorBaker:
     def _surface_fit(
         self, index: SectorIndex, geometry: Geometry, placed: placement.Placement, trial: adaptive.Trial | None
     ) -> SurfaceFit | None:
-        if trial is None or self._settings.wall_weights != "fitted":
+        if trial is None or self._readers is None:
             return None
         steps = [(x, z) for z in (-1, 0, 1) for x in (-1, 0, 1) if (x, z) != (0, 0)]
         around = [self._cut(SectorIndex(index.x + x, index.z + z)) for x, z in steps]
         where = (self.rays, self._solids, geometry, around, placed, self._settings, self._scene.rooms)
-        return SurfaceFit(*where, trial, self._trial_scene(READER_RAYS_PER_FACE_EDGE))
+        return SurfaceFit(*where, trial, self._readers)
 
     def _judge(self) -> ServedError:
         scene, settings = self._scene, self._settings
@@ -228,8 +229,7 @@ class SectorBaker:
         surface_fit = self._surface_fit(index, self._cut(index), placed, trial)
         if trial is None or surface_fit is None or self.trial is None:
             return placed, trial
-        lit = self._trial_scene(READER_RAYS_PER_FACE_EDGE)
-        return add_probes(surface_fit, index, self._settings, placed, trial, lit, self.trial)
+        return add_probes(surface_fit, index, self._settings, placed, trial, self.trial)
 
 
 def _surfaces(geometry: Geometry) -> Float64:

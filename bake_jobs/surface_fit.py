@@ -13,14 +13,14 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from bake_jobs.adaptive import DARK, DARK_LAMPLIGHT_LX, Trial
-from bake_jobs.border_weights import kept_at_border
+from bake_jobs.blend_candidates import LEAST_DISTANCE_M, kept_at_border, visible
 from bake_jobs.config import BakeSettings
 from bake_jobs.distinct import distinct
 from bake_jobs.fit import fit_weights
 from bake_jobs.inside import Solids
 from bake_jobs.placement import Placement
 from bake_jobs.rays import SURFACE_OFFSET_M, RayScene
-from bake_jobs.trial_fit import FAINT
+from bake_jobs.trial_fit import relative_rows
 from bake_jobs.trial_light import TrialScene
 from gi_core.ambient_cube import FACE_DIRECTIONS
 from gi_core.arrays import Bool, Float32, Float64, Int64, UInt16
@@ -88,6 +88,7 @@ class SurfaceFit:
         self._ray_scene, self._solids, self._rooms = ray_scene, solids, rooms
         self._geometry, self._around = geometry, around
         self._placement, self._settings, self._trial, self._trial_scene = placement, settings, trial, trial_scene
+        self._top_m = trial.air.centre[trial.air.own & trial.air.in_band, 1].max(initial=-np.inf)
 
     def fit(self, lattice: Int64, wanted: Bool, voxel_size_m: float) -> Fitted:
         """Those of the wanted voxels (V,) of a lattice (ny, nz, nx, 3) that surfaces below the band's top read."""
@@ -97,7 +98,7 @@ class SurfaceFit:
         readers = self._readers(lattice, wanted, voxel_size_m)
         if not len(outdoors) or not len(readers.place):
             return nothing
-        light = self._trial_scene.light(readers.place, self._trial.light.cells).cube
+        light = self.light(readers.place)
         states = self._trial.states
         # As placement does: closed places that no light comes into have no say.
         floor = np.where(states.lamps[states.fitted], DARK_LAMPLIGHT_LX, DARK).astype(np.float32)
@@ -141,9 +142,8 @@ class SurfaceFit:
     def both_sides(self, area_m2: float, geometry: Geometry | None = None) -> tuple[Float64, Float64]:
         """Points (n, 3) [m] on a surface, the sector's own if none is given, below the band's top, one for so much area and side, and unit
         normals (n, 3)."""
-        air = self._trial.air
         point, normal = _spread(self._geometry if geometry is None else geometry, area_m2)
-        low = point[:, 1] < air.centre[air.own & air.in_band, 1].max(initial=-np.inf)
+        low = point[:, 1] < self._top_m
         return np.concatenate([point[low], point[low]]), np.concatenate([normal[low], -normal[low]])
 
     def in_air(self, point: Float64, normal: Float64, off_m: float) -> tuple[Float64, Bool]:
@@ -151,6 +151,10 @@ class SurfaceFit:
         free = self._ray_scene.closest(point + 2 * SURFACE_OFFSET_M * normal, normal).distance.astype(np.float64)
         place = point + np.minimum(off_m, free / 2)[:, None] * normal
         return place, ~self._solids.contain(place) & (rooms_of(place, self._rooms) == ROOM_OUTDOORS)
+
+    def light(self, place: Float64) -> Float32:
+        """(n, S, 6): what is tried out at places (n, 3) [m]."""
+        return self._trial_scene.light(place, self._trial.light.cells).cube
 
     def unexplained(self, place: Float64, normal: Float64, light: Float32) -> Float64:
         """(n,), 0 to UNSEEN: how far the best blend of probes is from light (n, S, 6) at each place, relative, along its normal."""
@@ -177,9 +181,7 @@ class SurfaceFit:
         tried = min(CANDIDATES, len(outdoors))
         distance, near = cKDTree(position[outdoors]).query(place, k=tried)
         distance, near = distance.reshape(-1, tried), outdoors[near.reshape(-1, tried)]
-        way = (position[near] - place[:, None]) / np.maximum(distance, 1e-6)[:, :, None]
-        hidden = self._ray_scene.occluded(np.repeat(place, tried, axis=0), way.reshape(-1, 3), distance.reshape(-1) - SURFACE_OFFSET_M)
-        close = np.where(hidden.reshape(-1, tried), 0, 1 / np.maximum(distance, 0.25) ** 2)
+        close = np.where(visible(self._ray_scene, place, position[near], distance), 1 / np.maximum(distance, LEAST_DISTANCE_M) ** 2, 0)
         pair, of_pair = distinct((of[:, None] * len(position) + near[reader]).reshape(-1))
         voxel, probe = np.divmod(pair, len(position))
         closeness = kept_at_border(centre[voxel], position[probe][:, None], self._settings.margin_m)[:, 0]
@@ -196,10 +198,7 @@ class SurfaceFit:
     def _weights(self, target: Float32, turned: Float64, probe: Int64, closeness: Float64) -> Float32:
         """Weights (m, c) of candidates; target (m, S, 6), and how much (m, 6) each face of it counts."""
         fitted = self._trial.states.fitted
-        scale = np.maximum(target, FAINT * target.mean(axis=2, keepdims=True))
-        scale = (np.sqrt(turned)[:, None] / np.maximum(scale, 1e-9)).astype(np.float32)
-        rows = (target[:, fitted] * scale[:, fitted]).reshape(len(target), -1)
-        columns = (self._trial.probe_cube[probe][:, :, fitted] * scale[:, None, fitted]).reshape(*probe.shape, -1)
+        rows, columns = relative_rows(target, self._trial.probe_cube[probe], fitted, np.sqrt(turned)[:, None])
         prior = (closeness / closeness.sum(axis=1, keepdims=True)).astype(np.float32)
         return fit_weights(columns, rows, prior, self._settings.fit_ridge, self._settings.voxel_probes)
 

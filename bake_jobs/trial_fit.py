@@ -59,12 +59,8 @@ class TrialFit:
         trial, settings = self._trial, self._settings
         states = trial.states
         target = trial.light.cube[air]
-        scale = np.maximum(target, FAINT * target.mean(axis=2, keepdims=True))
-        scale = 1 / np.maximum(scale, np.float32(1e-9))
-        fitted = states.fitted
-        rows = (target[:, fitted] * scale[:, fitted]).reshape(len(air), -1)
         of_probes = trial.probe_cube[probes]
-        columns = (of_probes[:, :, fitted] * scale[:, None, fitted]).reshape(*probes.shape, -1)
+        rows, columns = relative_rows(target, of_probes, states.fitted)
         weight = fit_weights(columns, rows, prior.astype(np.float32), settings.fit_ridge, settings.voxel_probes)
         near = trial.air.own[air] & trial.air.in_band[air] & (trial.light.clearance[air] <= NEAR_SURFACE_M)
         if near.any():
@@ -72,6 +68,15 @@ class TrialFit:
             blend = np.einsum("nc,ncsf->nsf", weight[near], of_probes[near][:, :, states.judged])
             self._errors.append((np.abs(blend - truth) / np.maximum(truth, self._faint)).astype(np.float32).ravel())
         return weight
+
+
+def relative_rows(target: Float32, of_probes: Float32, fitted: slice, counts: Float64 | int = 1) -> tuple[Float32, Float32]:
+    """What ``fit_weights`` fits: of light (n, S, 6) the rows (n, r), and of candidates' (n, c, S, 6) the columns (n, c, r), in the fitted
+    states and relative to each face's own light; ``counts`` (n, 1, 6) is how much faces count, as a root."""
+    scale = np.maximum(target, FAINT * target.mean(axis=2, keepdims=True))
+    scale = (counts / np.maximum(scale, np.float32(1e-9))).astype(np.float32)
+    rows = (target[:, fitted] * scale[:, fitted]).reshape(len(target), -1)
+    return rows, (of_probes[:, :, fitted] * scale[:, None, fitted]).reshape(*of_probes.shape[:2], -1)
 
 
 def _slices(rows: Int64) -> Iterator[Int64]:

@@ -17,11 +17,11 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
 from bake_jobs.adaptive import Trial
-from bake_jobs.border_weights import FADE_M, kept_at_border, to_border
+from bake_jobs.blend_candidates import FADE_M, LEAST_DISTANCE_M, kept_at_border, to_border, visible
 from bake_jobs.config import BakeSettings
 from bake_jobs.inside import Solids
 from bake_jobs.placement import Placement
-from bake_jobs.rays import SURFACE_OFFSET_M, RayScene
+from bake_jobs.rays import RayScene
 from bake_jobs.surface_fit import SurfaceFit
 from bake_jobs.trial_fit import TrialFit
 from bake_jobs.voxel_classes import FILL_MARGIN, solid_voxels
@@ -135,12 +135,12 @@ def blend(
             candidates = min(max(most, settings.voxel_candidates), len(available))
             distance, near = tree.query(centre[some], k=candidates)
             distance, near = distance.reshape(len(some), candidates), available[near.reshape(len(some), candidates)]
-            sees = _visible(ray_scene, centre[some], placement.position[near], distance)
+            sees = visible(ray_scene, centre[some], placement.position[near], distance)
             blind_member = ~sees.any(axis=1)
             sees[blind_member, 0] = True
             blind[some] = blind_member
             kept = kept_at_border(centre[some], placement.position[near], settings.margin_m)
-            closeness = np.where(sees, kept / np.maximum(distance, 0.25) ** 2, 0)
+            closeness = np.where(sees, kept / np.maximum(distance, LEAST_DISTANCE_M) ** 2, 0)
             rows = np.arange(len(some))[:, None]
             share = np.zeros_like(closeness)
             closest = np.argsort(-closeness, axis=1, kind="stable")[:, :k]
@@ -152,16 +152,6 @@ def blend(
             weight[some, : best.shape[1]] = share[rows, best] / share.sum(axis=1, keepdims=True)
     probe[weight == 0] = 0
     return probe, weight, blind
-
-
-def _visible(ray_scene: RayScene, centre: Float64, probes: Float64, distance: Float64) -> Bool:
-    """(V, c) bool: nothing lies between each voxel centre (V, 3) and its candidates (V, c, 3)."""
-    voxels, candidates = distance.shape
-    reach = distance.reshape(-1)
-    offset = (probes - centre[:, None]).reshape(-1, 3)
-    direction = offset / np.maximum(reach, 1e-6)[:, None]
-    blocked = ray_scene.occluded(np.repeat(centre, candidates, axis=0), direction, reach - SURFACE_OFFSET_M)
-    return ~blocked.reshape(voxels, candidates)
 
 
 def nearest_lit(lit: Bool, shape: tuple[int, int, int]) -> tuple[Int64, Float64]:

@@ -71,10 +71,10 @@ from bake_jobs.table import Table, read_toml
 from gi_core.dataset import MAX_DECALS
 from gi_core.decals import MAX_SIZE_M, MAX_YAW_DEGREES, MIN_SIZE_M
 from gi_core.errors import SourceError
+from gi_core.room_records import MAX_ROOMS
 from gi_core.world import Decal, Location, Room
 
 HINT_KINDS = ("add", "forbid", "densify")
-MAX_ROOMS = 65_535  # a sector stores room numbers as uint16, and 0 is outdoors
 MAX_ROOM_M = 1000.0  # the largest halls; openings are looked for in every half metre or so of a room's faces
 Loader = Callable[[Path, MapFrame | None], SourceContent]
 

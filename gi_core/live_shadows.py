@@ -178,12 +178,8 @@ def lacks_samples(sector: LiveSector, to_sun: Float64, boxes: Float64) -> bool:
 
 def covered(plan: ShadowPlan, sectors: Collection[SectorIndex]) -> list[SectorIndex]:
     """Sectors whose own ground lies whole in a map, nearest first; a sector's far surfels are others' ground."""
-
-    def away(index: SectorIndex) -> float:
-        return float(np.abs((index.origin + SECTOR_SIZE_M / 2 - plan.middle)[[0, 2]]).max())
-
     near = sectors_within(HALF_MAP_M, plan.middle, sectors)
-    return sorted((index for index in near if plan.covers_whole(index)), key=lambda index: (away(index), index))
+    return sorted((index for index in near if plan.covers_whole(index)), key=lambda index: (plan.away_m(index), index))
 
 
 def sectors_within(distance_m: float, position: Float64, sectors: Collection[SectorIndex]) -> list[SectorIndex]:

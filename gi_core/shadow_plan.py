@@ -76,8 +76,11 @@ class ShadowPlan:
 
     def covers_whole(self, index: SectorIndex) -> bool:
         """Whether a sector's own ground lies in the map as far as its level extent goes."""
-        away = np.abs((index.origin + SECTOR_SIZE_M / 2 - self.middle)[[0, 2]]).max()
-        return bool(away + SECTOR_SIZE_M / 2 <= HALF_MAP_M)
+        return self.away_m(index) + SECTOR_SIZE_M / 2 <= HALF_MAP_M
+
+    def away_m(self, index: SectorIndex) -> float:
+        """From the map's middle to that of a sector's ground [m], along x or z, whichever is more."""
+        return float(np.abs((index.origin + SECTOR_SIZE_M / 2 - self.middle)[[0, 2]]).max())
 
 
 def plan_map(

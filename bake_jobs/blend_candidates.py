@@ -1,13 +1,16 @@
-"""What voxels near a border of sectors may blend: towards it they give up probes that the sector beyond does not hold, so that at the
-border line both sectors choose among the same (gi_core/MATH.md, "Steps across borders")."""
+"""Which probes a voxel may blend: those that it sees, and towards a border of sectors those that both sectors hold, so that at the border
+line both choose among the same (gi_core/MATH.md, "Steps across borders")."""
 
 import numpy as np
 
-from gi_core.arrays import Float64
+from bake_jobs.rays import SURFACE_OFFSET_M, RayScene
+from gi_core.arrays import Bool, Float64
 from gi_core.constants import SECTOR_SIZE_M, VOXEL_SIZE_M
 
 # Over the last two voxels before a border.
 FADE_M = 2 * VOXEL_SIZE_M
+# Probes nearer than this weigh no more than at this distance.
+LEAST_DISTANCE_M = 0.25
 
 
 def to_border(position: Float64) -> Float64:
@@ -25,3 +28,13 @@ def kept_at_border(centre: Float64, probes: Float64, margin_m: float) -> Float64
     held_by_both = np.abs(probes[:, :, [0, 2]] - line[:, None]) < margin_m
     share = np.minimum(to_border(centre) / FADE_M, 1)[:, None]
     return np.asarray(np.where(held_by_both, 1, share).prod(axis=2))
+
+
+def visible(ray_scene: RayScene, centre: Float64, probes: Float64, distance: Float64) -> Bool:
+    """(V, c) bool: nothing lies between each voxel centre (V, 3) and its candidates (V, c, 3)."""
+    voxels, candidates = distance.shape
+    reach = distance.reshape(-1)
+    offset = (probes - centre[:, None]).reshape(-1, 3)
+    direction = offset / np.maximum(reach, 1e-6)[:, None]
+    blocked = ray_scene.occluded(np.repeat(centre, candidates, axis=0), direction, reach - SURFACE_OFFSET_M)
+    return ~blocked.reshape(voxels, candidates)
