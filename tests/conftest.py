@@ -1,6 +1,7 @@
 """What several test folders share: the folder of real cities, random sectors, built scenes."""
 
-from collections.abc import Sequence
+import importlib.util
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,6 +27,17 @@ def shared_data() -> Path:
     if not SHARED_DATA.is_dir():
         pytest.skip("the real cities of ../shared/data are not beside this checkout")
     return SHARED_DATA
+
+
+@pytest.fixture(scope="session")
+def write_golden() -> Callable[..., None]:
+    """What writes a scene's dataset, as golden ones were written: tests/golden/make_golden.py, which is a script."""
+    spec = importlib.util.spec_from_file_location("make_golden", Path(__file__).parent / "golden" / "make_golden.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.write_golden
 
 
 def random_sector(

@@ -3,10 +3,7 @@
 The procedural city is baked at every run of the tests, Munich and Midtown by `make test-all`.
 """
 
-import importlib.util
 from dataclasses import dataclass
-from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -70,22 +67,13 @@ def city(request, tmp_path_factory) -> City:
 
 
 @pytest.fixture(scope="module")
-def street(tmp_path_factory, build) -> Engine:
+def street(tmp_path_factory, build, write_golden) -> Engine:
     """Two sectors of one street along x between two rows of houses without gaps."""
     folder = tmp_path_factory.mktemp("street")
     scene = build().ground((-64, 0), (64, 64), albedo=0.3)
     scene = scene.box((-63.99, -1, 0.01), (63.99, 14, 22)).box((-63.99, -1, 42), (63.99, 18, 63.99)).scene()
-    make_golden().write_golden(folder, settings_for("talk"), scene)
+    write_golden(folder, settings_for("talk"), scene)
     return Engine(Dataset.open(folder))
-
-
-def make_golden() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("make_golden_for_street", Path(__file__).parents[1] / "golden" / "make_golden.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def volume_of(city: City, index: SectorIndex, lighting: Lighting) -> Volume:

@@ -1,6 +1,5 @@
 """Light on the way through a door between two rooms, of which one is lit: it changes as the path tracer's does, not in one step."""
 
-import importlib.util
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,14 +20,10 @@ DOOR, WAY = np.array([30.1, 1.5, 24.0]), np.array([6.0, 0.0, 0.0])
 
 
 @pytest.fixture(scope="module")
-def engine(tmp_path_factory) -> Engine:
+def engine(tmp_path_factory, write_golden) -> Engine:
     """The scene of MATH.md's table: a hall with windows and a lamp, a study without, and a door between them."""
-    path = Path(__file__).parents[1] / "golden" / "make_golden.py"
-    spec = importlib.util.spec_from_file_location("make_golden_for_doors", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
     folder = tmp_path_factory.mktemp("doors")
-    module.write_golden(folder, QUICK, load_scene(SOURCE))
+    write_golden(folder, QUICK, load_scene(SOURCE))
     return Engine(Dataset.open(folder))
 
 

@@ -1,9 +1,7 @@
 """Rooms that the bake found, baked and lit: dark where they are closed, smooth where they are open, one room on both sides of a border."""
 
-import importlib.util
 from dataclasses import replace
 from datetime import date
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -28,16 +26,8 @@ DARK, LIT, HALL = 1, 2, 3
 DOOR, WAY = np.array([44.0, 1.5, 30.0]), np.array([0.0, 0.0, 6.0])
 
 
-def make_golden():
-    path = Path(__file__).parents[1] / "golden" / "make_golden.py"
-    spec = importlib.util.spec_from_file_location("make_golden_for_found_rooms", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 @pytest.fixture(scope="module")
-def engine(build, tmp_path_factory) -> Engine:
+def engine(build, tmp_path_factory, write_golden) -> Engine:
     """On a sector of ground two closed rooms with 10 cm between them, a lamp in one, and a hall with a door; no author said so."""
     block = build().ground((0, 0), (64, 64), albedo=0.4)
     for low, high in (((6, 0.1, 6), (18, 6, 22)), ((18.1, 0.1, 6), (30.1, 6, 22))):
@@ -51,7 +41,7 @@ def engine(build, tmp_path_factory) -> Engine:
     scene = block.scene(lamps=(LAMP,), location=place)
     scene = replace(scene, rooms=world_rooms(scene, "all"))
     folder = tmp_path_factory.mktemp("found")
-    make_golden().write_golden(folder, QUICK, scene)
+    write_golden(folder, QUICK, scene)
     return Engine(Dataset.open(folder))
 
 

@@ -1,9 +1,7 @@
 """Rooms drawn as meshes, baked and lit: no light crosses their walls, and the yard in an L's corner is not in the room."""
 
-import importlib.util
 from dataclasses import replace
 from datetime import date
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -36,16 +34,8 @@ def round_plan(radius: float) -> np.ndarray:
     return MIDDLE + radius * np.stack([np.cos(turn), np.sin(turn)], axis=1)
 
 
-def make_golden():
-    path = Path(__file__).parents[1] / "golden" / "make_golden.py"
-    spec = importlib.util.spec_from_file_location("make_golden_for_mesh_rooms", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 @pytest.fixture(scope="module")
-def engine(build, tmp_path_factory) -> Engine:
+def engine(build, tmp_path_factory, write_golden) -> Engine:
     """On a sector of ground a closed L, dark, and a closed round tower with a lamp in it; both have walls of 10 cm."""
     block = build().ground((0, 0), (64, 64), albedo=0.4)
     rooms = []
@@ -60,7 +50,7 @@ def engine(build, tmp_path_factory) -> Engine:
     place = Location(48.1, 11.6, 500.0, "Europe/Berlin", 0.0, date(2024, 6, 21), "given")
     scene = block.scene(lamps=(LAMP,), location=place, rooms=tuple(rooms))
     folder = tmp_path_factory.mktemp("meshes")
-    make_golden().write_golden(folder, QUICK, replace(scene, rooms=world_rooms(scene, "none")))
+    write_golden(folder, QUICK, replace(scene, rooms=world_rooms(scene, "none")))
     return Engine(Dataset.open(folder))
 
 

@@ -3,11 +3,9 @@
 The bound is the slides' own regret turned round: 0.1 % of the other side's light. Surfaces are sampled as clients sample them.
 """
 
-import importlib.util
 import shutil
 from dataclasses import replace
 from datetime import date
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -35,16 +33,8 @@ QUICK = {
 NIGHT_LAMP = Lamp("bulb", "point", (44.0, 6.0, 32.0), 20_000.0, (1.0, 1.0, 1.0), 40.0)
 
 
-def make_golden():
-    path = Path(__file__).parents[1] / "golden" / "make_golden.py"
-    spec = importlib.util.spec_from_file_location("make_golden_for_rooms", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 @pytest.fixture(scope="module")
-def engine(build, tmp_path_factory) -> Engine:
+def engine(build, tmp_path_factory, write_golden) -> Engine:
     """A closed block of two rooms on open ground; the lamp shines in one of them."""
     block = build().ground((-64, -64), (128, 128), albedo=0.4)
     for room in (DARK, LIT):
@@ -54,7 +44,7 @@ def engine(build, tmp_path_factory) -> Engine:
         rooms=(DARK, LIT), lamps=(NIGHT_LAMP,), location=Location(48.1, 11.6, 500.0, "Europe/Berlin", 0.0, date(2024, 6, 21), "given")
     )
     folder = tmp_path_factory.mktemp("rooms")
-    make_golden().write_golden(folder, replace(settings_for("talk"), **QUICK), scene)
+    write_golden(folder, replace(settings_for("talk"), **QUICK), scene)
     return Engine(Dataset.open(folder))
 
 
@@ -118,9 +108,9 @@ def test_day_does_not_darken_the_outside_of_a_dark_house(engine):
     assert beside.min() > 0.2 * np.median(beside)
 
 
-def test_a_room_of_planes_without_thickness_is_dark_at_noon_and_its_outside_bright(build, tmp_path):
+def test_a_room_of_planes_without_thickness_is_dark_at_noon_and_its_outside_bright(build, tmp_path, write_golden):
     scene = build().ground((-64, -64), (128, 128), albedo=0.4).box(DARK.minimum, DARK.maximum, albedo=0.6, inward=True)
-    make_golden().write_golden(tmp_path, replace(settings_for("talk"), **QUICK), scene.scene(rooms=(DARK,)))
+    write_golden(tmp_path, replace(settings_for("talk"), **QUICK), scene.scene(rooms=(DARK,)))
     sheets = Engine(Dataset.open(tmp_path))
     noon = sheets.lighting("12:00", "clear")
     dark = seen(sheets.interior(np.array([28.0, 4.0, 32.0]), noon, room="dark"), "dark")

@@ -1,11 +1,9 @@
 """The engine's queries: the same bytes whatever ran before, light everywhere by day, and trouble only where the trouble is."""
 
-import importlib.util
 import shutil
 import threading
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -27,15 +25,6 @@ IN_A_WALL = np.array([25.0, 4.0, 28.0])  # inside the golden scene's box
 NOON, EVENING = ("12:00", "clear"), ("17:30", "overcast")
 
 
-def make_golden() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("make_golden_for_engine", GOLDEN / "make_golden.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 @pytest.fixture(scope="module")
 def engine() -> Engine:
     return Engine(Dataset.open(GOLDEN / "v1"))
@@ -50,10 +39,10 @@ def city(tmp_path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def plane(tmp_path_factory, build) -> Engine:
+def plane(tmp_path_factory, build, write_golden) -> Engine:
     """Open ground under three by two sectors, nothing else."""
     folder = tmp_path_factory.mktemp("plane")
-    make_golden().write_golden(folder, scene=build().ground((-64, 0), (128, 128), albedo=0.3).scene())
+    write_golden(folder, scene=build().ground((-64, 0), (128, 128), albedo=0.3).scene())
     return Engine(Dataset.open(folder))
 
 
