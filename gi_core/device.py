@@ -3,7 +3,8 @@
 import os
 import threading
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import lru_cache
 from typing import Any
 
@@ -23,7 +24,8 @@ def available_devices() -> list[cl.Device]:
     """Every OpenCL device of every platform, in the order that the loader gives."""
     _pin_workers()
     try:
-        return [device for platform in cl.get_platforms() for device in platform.get_devices()]
+        with _polite_threads():
+            return [device for platform in cl.get_platforms() for device in platform.get_devices()]
     except cl.LogicError:
         return []
 
@@ -36,6 +38,28 @@ def _pin_workers() -> None:
     """
     if hasattr(os, "sched_getaffinity") and os.sched_getaffinity(0) == set(range(os.cpu_count() or 0)):
         os.environ.setdefault("POCL_AFFINITY", "1")
+
+
+@contextmanager
+def _polite_threads() -> Iterator[None]:
+    """Threads that are made meanwhile, PoCL's, wait for a processor that is free rather than stop whoever runs on theirs (Linux's
+    SCHED_BATCH, which they inherit).
+
+    Else one that wakes to do what a tick asks for stops the tick itself, which had more to ask of the other processor.
+    """
+    if not hasattr(os, "SCHED_BATCH") or os.sched_getscheduler(0) != os.SCHED_OTHER:
+        yield
+        return
+    own = os.sched_param(0)
+    try:
+        os.sched_setscheduler(0, os.SCHED_BATCH, own)
+    except OSError:  # not allowed here, as in some sandboxes
+        yield
+        return
+    try:
+        yield
+    finally:
+        os.sched_setscheduler(0, os.SCHED_OTHER, own)
 
 
 def describe(device: cl.Device) -> str:
@@ -73,42 +97,30 @@ class SharedKernel:
         self._knows_types = False
         self._lock = threading.Lock()
 
-    def launch(self, size: tuple[int, ...], group: tuple[int, ...] | None, *arguments: Any, queue: cl.CommandQueue | None = None) -> None:
+    def launch(
+        self,
+        size: tuple[int, ...],
+        group: tuple[int, ...] | None,
+        *arguments: Any,
+        queue: cl.CommandQueue | None = None,
+        offset: tuple[int, ...] | None = None,
+    ) -> None:
         """Enqueue the kernel: global and local size (None: the driver picks one), then buffers, None for those that the kernel does not
-        read, NumPy scalars and (1,) records, each of the same type at every launch. ``queue``: the device's own, or another lane."""
+        read, NumPy scalars and (1,) records, each of the same type at every launch. ``queue``: the device's own, or another lane;
+        ``offset``: the first work-item's global id."""
         with self._lock:
             if not self._knows_types:
                 self._kernel.set_scalar_arg_dtypes(
                     [None if given is None or isinstance(given, cl.Buffer) else given.dtype for given in arguments]
                 )
                 self._knows_types = True
-            event = self._kernel(queue or self._device.queue, size, group, *arguments)
+            event = self._kernel(queue or self._device.queue, size, group, *arguments, global_offset=offset)
         if self._device.launched is not None:
             self._device.launched.append((self._kernel.function_name, event))
 
     def launch_1d(self, items: int, *arguments: Any, queue: cl.CommandQueue | None = None) -> None:
         """Enqueue the kernel for some work-items, rounded up to whole work-groups of GROUP: kernels guard against the excess."""
         self.launch((-(-items // GROUP) * GROUP,), (GROUP,), *arguments, queue=queue)
-
-
-class BoundKernel:
-    """A kernel of one owner, whose arguments stay set from launch to launch, all but the last ones: to set them takes most of a launch's
-    time. Making one takes 0.1 ms. One thread at a time."""
-
-    def __init__(self, device: "Device", kernel: cl.Kernel, *arguments: Any) -> None:
-        """The first arguments, as SharedKernel takes them."""
-        self._device, self._kernel = device, kernel
-        self._bound = arguments  # OpenCL does not keep buffers alive
-        for place, given in enumerate(arguments):
-            kernel.set_arg(place, given)
-
-    def launch_task(self, queue: cl.CommandQueue, number: int, *last: cl.Buffer | None) -> None:
-        """Enqueue one work-item with the arguments that are not bound. Its global id is ``number``: a scalar that need not be set."""
-        for place, given in enumerate(last, len(self._bound)):
-            self._kernel.set_arg(place, given)
-        event = cl.enqueue_nd_range_kernel(queue, self._kernel, (1,), (1,), (number,))
-        if self._device.launched is not None:
-            self._device.launched.append((self._kernel.function_name, event))
 
 
 class Device:

@@ -23,7 +23,7 @@ from gi_core.constants import BASIS_SIZES
 from gi_core.device import Device
 from gi_core.layout import BOUNCE, MAX_DIRECTIONAL_LIGHTS
 from gi_core.relight_input import RelightInput
-from gi_core.relight_launch import SURFELS_PER_GROUP, About, Launch, relight_launch
+from gi_core.relight_launch import SURFELS_PER_GROUP, RelightTask, launch_relight
 from gi_core.rooms import outdoor_blend
 from gi_core.sector import Sector, starts
 
@@ -89,8 +89,6 @@ class ResidentSector:
         self._bounces_of: float | None = None
         self._no_bounces: cl.Buffer | None = None
         self._is_lit_anew = True
-        self._launch: tuple[About, Launch] | None = None
-        """Of the sector's own passes."""
 
     @property
     def nbytes(self) -> int:
@@ -174,16 +172,13 @@ class ResidentSector:
     def enqueue(self, queue: cl.CommandQueue, passes: int) -> None:
         """Enqueue passes, each one more bounce on the cubes that the sector holds. ``light`` comes first."""
         if self.sector.probe_count:
-            about = self._about(self.bounce_starts, self.cubes)
-            if self._launch is None or self._launch[0] != about:
-                self._launch = about, relight_launch(self, about)
-            self._run(self._launch[1], queue, passes)
+            self._run(queue, passes, self.bounce_starts, self.cubes)
 
     def enqueue_first_bounce(self, cubes: cl.Buffer) -> None:
         """Enqueue what one pass from darkness gives, into other cubes than the sector's own: sky and the first surface alone."""
         if self.sector.probe_count:
             self._no_bounces = self._no_bounces or self.device.allocate(4 * (self.sector.brick_count + 1))
-            self._run(relight_launch(self, self._about(self._no_bounces, cubes)), self.device.queue, 1)
+            self._run(self.device.queue, 1, self._no_bounces, cubes)
 
     def converted(self, basis: str, cubes: cl.Buffer | None = None) -> cl.Buffer:
         """The sector's light, or other ``cubes`` of its probes, in a basis that is served: a buffer that the next call writes again.
@@ -243,16 +238,11 @@ class ResidentSector:
             kernel.launch_1d(bricks, np.uint32(bricks), self.brick_starts, *normals, norm, directional, found)
         return found
 
-    def _about(self, bounce_starts: cl.Buffer | None, cubes: cl.Buffer) -> About:
+    def _run(self, queue: cl.CommandQueue, passes: int, bounce_starts: cl.Buffer | None, cubes: cl.Buffer) -> None:
         assert self._light is not None
-        given = self._light.given
+        snow = self._light.given.snow if self._has_snow else 0.0
         glow = self.brick_emission if self.lamps_on_bricks is None else self.lamps_on_bricks
-        snow = given.snow if self._has_snow else 0.0
-        return About(len(given.lights), snow, glow, self.sun_sample, self.sun_share, self.bounces, bounce_starts, cubes)
-
-    def _run(self, launch: Launch, queue: cl.CommandQueue, passes: int) -> None:
-        assert self._light is not None
-        launch(queue, passes, self._is_lit_anew, self._light)
+        launch_relight(self, RelightTask(passes, self._is_lit_anew, self._light, snow, glow, bounce_starts, cubes), queue)
         self._is_lit_anew = False
 
     def _make_room_for_sun(self, lights: int) -> None:

@@ -4,7 +4,7 @@
 // For processors. Between two kernels of a queue PoCL takes some 10 us to put threads to sleep and to wake them, as long as a kernel works
 // on half a sector; here a sector's data stay with one core, and another has the tick's other sector.
 //
-// The global id is 2 * passes, and one more if the light is another than at the last launch: so all arguments can stay set.
+// The global id is 2 * passes, and one more if the light is another than at the last launch.
 //
 // Defines: those of the four.
 #include "bounce_bricks.cl"
