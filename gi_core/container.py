@@ -18,6 +18,7 @@ import numpy as np
 import zstandard
 
 from gi_core.arrays import AnyArray
+from gi_core.background import give_way
 from gi_core.errors import CorruptFileError, FormatVersionError
 
 MAGIC = b"SECTORLT"
@@ -30,6 +31,9 @@ MAX_RAW_BYTES = 1 << 28
 MAX_HEADER_BYTES = 1 << 20
 MAX_ARRAYS = 64
 MAX_FILE_BYTES = PREFIX_BYTES + MAX_HEADER_BYTES + MAX_RAW_BYTES
+# Steps between which a thread that loads may wait. Of the packed ones none can make more than half of MAX_RAW_BYTES: a block of zstd takes
+# four bytes at least and gives 128 kB at most.
+_STEP_BYTES, _PACKED_STEP_BYTES = 1 << 17, 1 << 12
 # A higher level takes a tenth of a second more for a sector of the preset talk, a fifth of its bake, and saves 4 %.
 ZSTD_LEVEL = 12
 
@@ -44,6 +48,7 @@ class Container:
 
     def take(self, name: str, dtype: str, ndim: int) -> AnyArray:
         """The array of that name. Raises CorruptFileError when it is absent or of another dtype or rank."""
+        give_way()
         found = self.arrays.get(name)
         if found is None:
             raise CorruptFileError(f"array {name!r} is missing; it has {sorted(self.arrays)}")
@@ -114,7 +119,7 @@ def decode(data: bytes, kind: str, version: int | tuple[int, ...], where: str) -
         # The frame's own size is what the decompressor allocates, whatever it is told.
         if zstandard.frame_content_size(payload) != raw_bytes:
             raise CorruptFileError(f"{where}: expected one zstd frame of {raw_bytes} bytes; bake it again")
-        raw = zstandard.ZstdDecompressor().decompress(payload, allow_extra_data=False) if raw_bytes else b""
+        raw = _decompress(payload, raw_bytes)
         if not isinstance(parsed["meta"], dict):
             raise CorruptFileError(f"{where}: expected meta to be an object; bake it again")
         return Container(parsed["meta"], _read_arrays(parsed["arrays"], raw, raw_bytes, where), found_version)
@@ -152,8 +157,28 @@ def _digest(prefix: bytes, header: bytes, payload: bytes) -> bytes:
     h = hashlib.blake2b(digest_size=16)
     h.update(prefix[:_DIGEST_OFFSET])
     h.update(header)
-    h.update(payload)
+    view = memoryview(payload)
+    for at in range(0, len(view), _STEP_BYTES):
+        give_way()
+        h.update(view[at : at + _STEP_BYTES])
     return h.digest()
+
+
+def _decompress(payload: bytes, raw_bytes: int) -> bytearray:
+    """One zstd frame whose size is known. Raises zstandard.ZstdError, and ValueError for what is not one whole frame of that size."""
+    raw = bytearray(raw_bytes)
+    at = 0
+    frame = zstandard.ZstdDecompressor().decompressobj()
+    for start in range(0, len(payload), _PACKED_STEP_BYTES):
+        give_way()
+        made = frame.decompress(payload[start : start + _PACKED_STEP_BYTES])
+        if frame.unused_data or at + len(made) > raw_bytes:
+            raise ValueError("more than one zstd frame")
+        raw[at : at + len(made)] = made
+        at += len(made)
+    if at != raw_bytes or not frame.eof:
+        raise ValueError("the zstd frame is cut off")
+    return raw
 
 
 def interleaved(rows: AnyArray) -> AnyArray:
@@ -178,12 +203,13 @@ def _unpack(raw: memoryview, dtype: "np.dtype[Any]", shape: tuple[int, ...], del
     return values
 
 
-def _read_arrays(table: list[dict[str, Any]], raw: bytes, raw_bytes: int, where: str) -> dict[str, AnyArray]:
+def _read_arrays(table: list[dict[str, Any]], raw: bytearray, raw_bytes: int, where: str) -> dict[str, AnyArray]:
     if len(raw) != raw_bytes or len(table) > MAX_ARRAYS:
         raise CorruptFileError(f"{where}: expected {raw_bytes} bytes in at most {MAX_ARRAYS} arrays, found {len(raw)} in {len(table)}")
     arrays: dict[str, AnyArray] = {}
     offset = 0
     for entry in table:
+        give_way()
         name, code, shape = str(entry["name"]), str(entry["dtype"]), entry["shape"]
         delta = entry["delta"] is True
         if code not in _DTYPES or (delta and code[0] == "f") or name in arrays:

@@ -12,6 +12,7 @@ import numpy as np
 import pyopencl as cl
 
 from gi_core import layout, pocl_cpu
+from gi_core.background import give_way
 from gi_core.errors import DeviceError, KernelBuildError
 from kernels_cl import include_directory, source
 
@@ -188,6 +189,7 @@ class Device:
 
     def upload(self, values: "np.ndarray[Any, Any]") -> cl.Buffer:
         """A read-only buffer with the array's bytes; never empty, since OpenCL has no empty buffers."""
+        give_way()
         data = np.ascontiguousarray(values)
         if data.nbytes == 0:
             data = np.zeros(16, np.uint8)

@@ -23,6 +23,7 @@ import numpy as np
 
 from gi_core import quantise
 from gi_core.arrays import AnyArray, Float16, Float32, Float64, Int8, Int64, UInt8, UInt32
+from gi_core.background import give_way
 from gi_core.basis import SH_COSINE, SH_NORM, basis_of_size, factor_shares
 from gi_core.constants import BASIS_SIZES
 
@@ -95,11 +96,14 @@ def device_scale(codes: Codes) -> Float32:
 def share_sums(codes: Codes, factor_starts: AnyArray, sky_starts: AnyArray) -> Float64:
     """(P, 6), of harmonics (P, 1), the first: each probe's shares summed, which must not exceed one; of one factor or more."""
     code, scale = codes.factor_code[:, : codes.factor_scale.shape[2]], codes.factor_scale
-    wide = np.ascontiguousarray(code.T).astype(np.int16 if code.dtype == np.int8 else np.uint16)
     first = np.stack([factor_starts[:-1], sky_starts], axis=1).astype(np.int64).reshape(-1)
     sums = np.zeros((code.shape[1], len(first)), np.int64)
     has = _run_lengths(factor_starts, sky_starts) > 0
-    sums[:, has] = np.add.reduceat(wide * wide, first[has], axis=1, dtype=np.int64)
+    for b in range(code.shape[1]):
+        give_way()
+        # Squares of the most factors that a probe may have, 65 535, add up to less than 2^32.
+        square = np.square(code[:, b].astype(np.int32)).view(np.uint32)
+        sums[b, has] = np.add.reduceat(square, first[has], dtype=np.uint32)
     scaled = sums.T.reshape(scale.shape) * scale.astype(np.float64)
     return np.asarray(scaled.sum(axis=1) / np.iinfo(code.dtype).max ** 2)
 

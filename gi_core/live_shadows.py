@@ -8,7 +8,7 @@ from concurrent.futures import Future
 import numpy as np
 
 from gi_core.arrays import AnyArray, Float64
-from gi_core.background import background_thread
+from gi_core.background import RightOfWay, background_thread, give_way
 from gi_core.constants import SECTOR_SIZE_M
 from gi_core.dataset import Dataset
 from gi_core.device import Device
@@ -54,13 +54,14 @@ class LiveShadows:
     volume reads: a sector that a walker comes to is sampled before anybody sees it, and need not fade.
     """
 
-    def __init__(self, device: Device, dataset: Dataset) -> None:
+    def __init__(self, device: Device, dataset: Dataset, ticks: RightOfWay) -> None:
+        """The planner's thread gives way to ``ticks``."""
         self._known = frozenset(dataset.world.sectors)
         self._dataset = dataset
         low, high = dataset.world.bounds[:, 1]
         self._heights = float(low), float(high)
         self._map = ShadowMap(device, self._cast, self._heights[1])
-        self._planner = background_thread("shadow-planner")
+        self._planner = background_thread("shadow-planner", ticks)
         self._casters: OrderedDict[SectorIndex, AnyArray] = OrderedDict()
         """What the planner has read, its own."""
         self._planning: Future[tuple[ShadowPlan | None, Casters]] | None = None
@@ -153,6 +154,7 @@ class LiveShadows:
             return None, {}
         casters = {}
         for index in plan.sectors:
+            give_way()
             casters[index] = self._casters[index] = self._casters.pop(index) if index in self._casters else self._read(index)
         held = sum(records.nbytes for records in self._casters.values())
         while held > KEPT_BYTES:

@@ -22,6 +22,7 @@ import numpy as np
 import pyopencl as cl
 
 from gi_core.arrays import Float32, Float64
+from gi_core.background import RightOfWay
 from gi_core.basis import conversion
 from gi_core.constants import BASIS_SIZES, VOLUME_SHAPE
 from gi_core.dataset import Dataset
@@ -105,7 +106,10 @@ class LiveWorld:
         self.basis = basis
         self._geometry = ShadowGeometry(dataset.geometry, dataset.world.sectors)
         self._tracing = threading.Lock()
-        self.streamer = Streamer(sector_table(dataset.world), dataset.sector, self._place, stream or StreamOptions(budget_bytes))
+        self.right_of_way = RightOfWay()
+        """What threads that load and plan give to whoever takes it for a tick."""
+        options = stream or StreamOptions(budget_bytes)
+        self.streamer = Streamer(sector_table(dataset.world), dataset.sector, self._place, options, self.right_of_way)
         self.streamer.lamps_planned = bool(dataset.world.lamps)
         self.volumes = LiveVolumes(self._device, frozenset(dataset.world.sectors), self.streamer.residents, basis)
         self._needs = LightNeeds(len(self.streamer.table.sectors))
@@ -117,7 +121,7 @@ class LiveWorld:
         self._placeholders: dict[SectorIndex, Float32] = {}
         """Of this tick's light."""
         self._texel_of = {index: texel for texel, index in enumerate(self._distant.sectors())}
-        self._shadows = LiveShadows(self._device, dataset) if shadow_map else None
+        self._shadows = LiveShadows(self._device, dataset, self.right_of_way) if shadow_map else None
 
     @property
     def device_name(self) -> str:

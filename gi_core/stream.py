@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gi_core.arrays import Float64, Int64
-from gi_core.background import background_thread
+from gi_core.background import RightOfWay, background_thread
 from gi_core.constants import BASIS_SIZES
 from gi_core.dataset import SectorFacts, WorldInfo
 from gi_core.grid import SectorIndex
@@ -73,9 +73,15 @@ class Streamer:
     """
 
     def __init__(
-        self, table: SectorTable, load: Callable[[SectorIndex], Sector], place: Callable[[Sector], LiveSector], options: StreamOptions
+        self,
+        table: SectorTable,
+        load: Callable[[SectorIndex], Sector],
+        place: Callable[[Sector], LiveSector],
+        options: StreamOptions,
+        ticks: RightOfWay,
     ) -> None:
-        """``load`` reads a sector (``Dataset.sector``), ``place`` puts it on the device; both are called by loaders' threads."""
+        """``load`` reads a sector (``Dataset.sector``), ``place`` puts it on the device: both are called by a loader's thread, which gives
+        way to ``ticks``."""
         self.residents: dict[SectorIndex, LiveSector] = {}
         self.failures: dict[SectorIndex, Failure] = {}
         self.loads = self.misses = 0
@@ -91,7 +97,7 @@ class Streamer:
         self._rows: Int64 = np.zeros(0, np.int64)
         self._done: queue.SimpleQueue[tuple[SectorIndex, LiveSector | Exception]] = queue.SimpleQueue()
         # One thread: decoding holds Python's lock half of the time, and more would take it from the ticks.
-        self._loader = background_thread("sector-loader")
+        self._loader = background_thread("sector-loader", ticks)
 
     @property
     def loading(self) -> int:

@@ -147,7 +147,8 @@ class Ticker:
                 self.stats.skipped += overdue
                 number += overdue
                 due += overdue * period_s
-            self._tick(number, due, period_s)
+            with self.world.right_of_way.taken():
+                self._tick(number, due, period_s)
             self._running.set()
 
     def _tick(self, number: int, due: float, period_s: float) -> None:

@@ -4,6 +4,7 @@ import struct
 
 import numpy as np
 import pytest
+import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -59,11 +60,9 @@ def test_another_version_says_which_and_what_to_do(data):
         container.decode(data, "SECT", 3, "here")
 
 
-def forged(header: bytes, raw: bytes, raw_bytes: int | None = None) -> bytes:
+def forged(header: bytes, raw: bytes, raw_bytes: int | None = None, payload: bytes | None = None) -> bytes:
     """A file with a right checksum around a wrong header: an attacker can compute checksums too."""
-    import zstandard
-
-    payload = zstandard.ZstdCompressor().compress(raw)
+    payload = zstandard.ZstdCompressor(write_checksum=True).compress(raw) if payload is None else payload
     prefix = struct.pack(
         "<8s4sIIIQQ16s8x",
         container.MAGIC,
@@ -103,6 +102,26 @@ def test_a_decompression_bomb_is_refused_before_it_unpacks():
     bomb = forged(b'{"meta":{},"arrays":[]}', bytes(10), raw_bytes=1 << 40)
     with pytest.raises(CorruptFileError):
         container.decode(bomb, "TEST", 3, "here")
+
+
+RAW = np.random.default_rng(1).integers(0, 9, 50_000).astype(np.uint8).tobytes()
+FRAME = zstandard.ZstdCompressor(write_checksum=True).compress(RAW)
+OF_RAW = b'{"meta":{},"arrays":[{"name":"x","dtype":"u1","shape":[50000],"delta":false}]}'
+
+
+def test_a_frame_of_many_steps_is_read():
+    assert len(FRAME) > 2 * container._PACKED_STEP_BYTES
+    assert container.decode(forged(OF_RAW, RAW), "TEST", 3, "here").arrays["x"].tobytes() == RAW
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [FRAME + b"\0", FRAME + FRAME, FRAME + bytes(2 * container._PACKED_STEP_BYTES), FRAME[:-1], FRAME[:-4], FRAME[: len(FRAME) // 2]],
+    ids=["a byte more", "two frames", "many bytes more", "without its last byte", "without its checksum", "half of it"],
+)
+def test_what_is_not_one_whole_frame_is_refused(payload):
+    with pytest.raises(CorruptFileError):
+        container.decode(forged(OF_RAW, RAW, payload=payload), "TEST", 3, "here")
 
 
 def test_a_file_is_whole_or_absent(tmp_path, monkeypatch):
