@@ -98,7 +98,7 @@ class LiveShadows:
         if self._to_sample and plan is not None and is_near(plan.to_sun, light.to_sun):
             some = self._to_sample[: shares * SECTORS_SAMPLED_PER_TICK]
             del self._to_sample[: shares * SECTORS_SAMPLED_PER_TICK]
-            chosen = tuple(i for i in some if i in residents and lacks_samples(residents[i], plan.to_sun, plan.boxes))
+            chosen = tuple(i for i in some if i in residents and is_outdated(residents[i].sampled_of, plan.to_sun, plan.boxes))
             for index in chosen:
                 residents[index].sample_sun(self._map)
             return chosen
@@ -126,8 +126,9 @@ class LiveShadows:
         count = len(positions)
         for offset in range(min(count, PLAYERS_LOOKED_AT_PER_TICK)):
             player = (self._turn + offset) % count
-            here = sectors_within(NEAR_M, positions[player], residents)
-            if any(lacks_samples(residents[index], to_sun, boxes) for index in here):
+            # Neighbours have their samples of one map, mostly.
+            sources = {residents[index].sampled_of for index in sectors_within(NEAR_M, positions[player], residents)}
+            if any(is_outdated(source, to_sun, boxes) for source in sources):
                 self._turn = player + 1
                 self._planning = self._planner.submit(self._prepare, positions[player].copy(), to_sun, boxes)
                 return
@@ -172,10 +173,9 @@ class LiveShadows:
         return self._to_draw[index]
 
 
-def lacks_samples(sector: LiveSector, to_sun: Float64, boxes: Float64) -> bool:
-    """Whether a sector has no samples, or old ones: the sun or a box has moved since."""
-    of = sector.sampled_of
-    return of is None or sun_or_box_moved(of, to_sun, boxes)
+def is_outdated(source: ShadowPlan | None, to_sun: Float64, boxes: Float64) -> bool:
+    """Whether a sector with samples of this map, or none, lacks samples: the sun or a box has moved since."""
+    return source is None or sun_or_box_moved(source, to_sun, boxes)
 
 
 def covered(plan: ShadowPlan, sectors: Collection[SectorIndex]) -> list[SectorIndex]:

@@ -2,11 +2,11 @@
 
 A tick, in order:
 
-    take over    sectors that loaders have finished
-    stream       plan loads and evictions for where players are and go
-    relight      the sectors that tick_plan chooses; in an idle world one sector that has not settled exactly
-    shadow map   draw some more of the next one; sectors take samples of one that was just drawn
+    relight      take over sectors that loaders have finished, and relight those that tick_plan chooses; in an idle world one that has not
+                 settled exactly
     volumes      of players who moved, or near whom something was relit, until the tick's time for it is spent; the rest wait
+    shadow map   draw some more of the next one; sectors take samples of one that was just drawn
+    stream       plan loads and evictions for where players are and go; after a long tick the next does, for a while
 
 Lighting belongs to the world: players share lit sectors, only volumes are theirs. One thread calls ``tick``; what it publishes is
 anybody's. No file is read and no kernel compiled in it, once ``warm_up`` has run.
@@ -46,6 +46,8 @@ from gi_core.tick_plan import PLACES, plan_tick
 from gi_core.volume import box_record, plan_boxes
 
 DEFAULT_BUDGET_BYTES = 512 << 20
+# A tick that has taken this long [ms] leaves planning to later ones, at most so often on end. Sectors are planned for seconds ahead.
+LONG_TICK_MS, MOST_PUT_OFF = 1.5, 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,6 +114,10 @@ class LiveWorld:
         self.streamer = Streamer(sector_table(dataset.world), dataset.sector, self._place, options, self.right_of_way)
         self.streamer.lamps_planned = bool(dataset.world.lamps)
         self.volumes = LiveVolumes(self._device, frozenset(dataset.world.sectors), self.streamer.residents, basis)
+        self._evicted: tuple[SectorIndex, ...] = ()
+        """Since volumes were last told of changes."""
+        self._put_off = 0
+        """How many ticks ago the streaming plan was wanted."""
         self._needs = LightNeeds(len(self.streamer.table.sectors))
         self._row = {index: row for row, index in enumerate(self.streamer.table.sectors)}
         self._light: LiveLight | None = None
@@ -152,27 +158,32 @@ class LiveWorld:
         report.loaded = tuple(self.streamer.take_over())
         for index in report.loaded:
             self._needs.forget(self._row[index])
-        self.plan = self.streamer.step(players.positions, players.velocities)
-        report.evicted = self.plan.evictions
-        lap("stream")
         gains_changed = self._light is not None and self._light.settings != light.settings
         if light is not self._light:
             self._placeholders.clear()
         self._light = light
         self._relight(tick, light, report)
         lap("relight")
-        if self._shadows is not None:
-            sampled = self._shadows.step(players.positions, light, boxes, self.streamer.residents)
-            for index in sampled:
-                other = index in self.streamer.residents and self.streamer.residents[index].has_other_source
-                self._needs.disturb(self._row[index], WHOLLY if other else BURST_CHANGE)
-        lap("shadow_map")
         report.missing = self.volumes.missing
         changed = self._advance(tick, gains_changed, report)
         self.volumes.note(tick, players.ids, players.positions, changed)
         until_s = started + fill_ms / 1e3
         report.filled, report.waiting = self.volumes.fill(tick, until_s, lambda sector: self._shown(sector, light), self._placeholder)
         lap("volumes")
+        if self._shadows is not None:
+            sampled = self._shadows.step(players.positions, light, boxes, self.streamer.residents)
+            for index in sampled:
+                other = index in self.streamer.residents and self.streamer.residents[index].has_other_source
+                self._needs.disturb(self._row[index], WHOLLY if other else BURST_CHANGE)
+        lap("shadow_map")
+        is_long = (time.perf_counter() - started) * 1e3 > LONG_TICK_MS
+        if is_long and self._put_off < MOST_PUT_OFF and not self.streamer.is_overfull:
+            self._put_off += 1
+        else:
+            self._put_off = 0
+            self.plan = self.streamer.step(players.positions, players.velocities)
+            report.evicted = self._evicted = self.plan.evictions
+        lap("stream")
         return report
 
     def warm_up(self) -> None:
@@ -260,7 +271,8 @@ class LiveWorld:
 
     def _advance(self, tick: int, gains_changed: bool, report: TickReport) -> list[SectorIndex]:
         """Sectors that show something else from this tick on, or are gone."""
-        residents, changed = self.streamer.residents, list(report.evicted)
+        residents, changed = self.streamer.residents, list(self._evicted)
+        self._evicted = ()
         # Others have shown what they show since they were looked at last.
         self._fading.update(report.loaded, report.relit, report.settled)
         for index in list(residents) if gains_changed else self._fading.intersection(residents):

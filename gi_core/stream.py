@@ -84,7 +84,7 @@ class Streamer:
         way to ``ticks``."""
         self.residents: dict[SectorIndex, LiveSector] = {}
         self.failures: dict[SectorIndex, Failure] = {}
-        self.loads = self.misses = 0
+        self.loads = 0
         self.lamps_planned = False
         """Whether sectors that arrive are counted with room for lamps."""
         self.table, self._load, self._place, self._options = table, load, place, options
@@ -108,6 +108,11 @@ class Streamer:
     def resident_bytes(self) -> int:
         """Bytes on the device and in the host's memory, as the plan counts them."""
         return int(self._state.resident_bytes.sum())
+
+    @property
+    def is_overfull(self) -> bool:
+        """Whether sectors take more than the budget, since one has turned out larger: the next step must make them fit."""
+        return self.resident_bytes + int(self.table.bytes[self._state.loading].sum()) > self._options.budget_bytes
 
     def take_over(self) -> list[SectorIndex]:
         """Make resident what loaders have finished; those sectors. Failures are noted, to be tried again later."""
@@ -142,7 +147,6 @@ class Streamer:
         """
         plan = self._plan
         if plan is not None and self._holds(positions, velocities):
-            self.misses += len(plan.missing)
             return plan
         plan = plan_streaming(self.table, self._state, positions, velocities, now_s=time.monotonic(), options=self._options)
         for index in plan.evictions:
@@ -153,7 +157,6 @@ class Streamer:
             self._loading.add(index)
             self._state.loading[self._row[index]] = True
             self._loader.submit(self._bring, index)
-        self.misses += len(plan.missing)
         self._plan, self._planned = replace(plan, loads=(), evictions=()), (positions, velocities, time.monotonic())
         return plan
 
