@@ -52,7 +52,6 @@ class SurfelLights:
         self._bits = ShadowBits(device, self._words)
         self._static = self._dynamic = _Lit()
         self._static_sum: cl.Buffer | None = None
-        self._kernels: dict[str, cl.Kernel] = {}
 
     @property
     def nbytes(self) -> int:
@@ -196,11 +195,8 @@ class SurfelLights:
             self._run("light_surfels", (_ITEMS_PER_WORD * self._words, 1), arguments)
 
     def _run(self, name: str, size: tuple[int, int], arguments: list[object]) -> None:
-        # Making a kernel takes longer than running it.
-        if name not in self._kernels:
-            self._kernels[name] = self._device.kernel(name)
         rounded = -(-size[0] // GROUP) * GROUP
-        self._kernels[name](self._device.queue, (rounded, size[1]), (GROUP, 1), *arguments)
+        self._device.shared_kernel(name).launch((rounded, size[1]), (GROUP, 1), *arguments)
 
     def _surfel_places(self) -> cl.Buffer:
         if self._places is None:

@@ -14,7 +14,7 @@ anybody's. No file is read and no kernel compiled in it, once ``warm_up`` has ru
 
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 
@@ -27,10 +27,12 @@ from gi_core.basis import conversion
 from gi_core.constants import BASIS_SIZES, VOLUME_SHAPE
 from gi_core.dataset import Dataset
 from gi_core.device import Device
+from gi_core.geometry_file import Geometry
 from gi_core.grid import SectorIndex, volume_first_voxel
 from gi_core.layout import DIRECTIONAL_LIGHT, MAX_DIRECTIONAL_LIGHTS
 from gi_core.light_geometry import ShadowGeometry
 from gi_core.light_needs import WHOLLY, LightNeeds
+from gi_core.light_surfels import SurfelLights
 from gi_core.live_sector import BURST_CHANGE, BURST_PASSES, FIRST_PASSES, LiveLight, LiveSector
 from gi_core.live_shadows import LiveShadows
 from gi_core.live_volume import PublishedVolume
@@ -44,6 +46,7 @@ from gi_core.stream import Streamer, sector_table
 from gi_core.stream_plan import StreamOptions, StreamPlan
 from gi_core.tick_plan import PLACES, plan_tick
 from gi_core.volume import box_record, plan_boxes
+from gi_core.world import Lamp
 
 DEFAULT_BUDGET_BYTES = 512 << 20
 # A tick that has taken this long [ms] leaves planning to later ones, at most so often on end. Sectors are planned for seconds ahead.
@@ -194,16 +197,18 @@ class LiveWorld:
         if not lit:
             return
         index = min(lit, key=lambda i: (world.sectors[i].surfels, i))
-        sector = self._place(self.dataset.sector(index))
-        lamp_light = self._device.allocate(16 * sector.resident.sector.surfel_count)
+        read = self.dataset.sector(index)
+        sector = self._place(read)
+        lamps = _lit_by_a_lamp(self._device, read, world.sectors)
         samples = self._device.allocate(sector.resident.sector.surfel_count + 8)
-        for lights, snow, lamps, sun_map in product(range(MAX_DIRECTIONAL_LIGHTS + 1), (0.0, 0.5), (None, lamp_light), (None, samples)):
-            sector.resident.set_lamps(lamps)
+        for lights, snow, shining, sun_map in product(range(MAX_DIRECTIONAL_LIGHTS + 1), (0.0, 0.5), (None, lamps.buffer), (None, samples)):
+            sector.resident.set_lamps(shining)
             sector.resident.set_sun_sample(sun_map)
             dark = np.zeros(lights, DIRECTIONAL_LIGHT.dtype)
             given = RelightInput(np.ones((world.sky_patches, 3), np.float32), dark, snow, world.sky)
             self._relighter.relight([sector.resident], given)
-        for settings in (NEUTRAL, Settings(bounce_factor=2.0)):
+        for tick, settings in enumerate((NEUTRAL, Settings(bounce_factor=2.0))):
+            sector.advance(tick, must_show=True, is_read=True)
             # The sector's own part of a volume around its middle: what lies beyond its voxels must not be read.
             box = next(box for box in plan_boxes(volume_first_voxel(index.origin + 32.0)) if box.index == index)
             target = self._device.allocate(4 * 3 * BASIS_SIZES[self.basis] * int(np.prod(VOLUME_SHAPE)))
@@ -299,3 +304,13 @@ class LiveWorld:
                 found = texels.transfer.light(light.given, light.lighting, slice(texel, texel + 1))[0]
             self._placeholders[index] = found
         return self._placeholders[index]
+
+
+def _lit_by_a_lamp(device: Device, sector: Sector, sectors: Collection[SectorIndex]) -> SurfelLights:
+    """A sector of a world with ``sectors`` beside a lamp and a triangle, neither of which is the world's: no geometry is read."""
+    beside = sector.index.origin + sector.surfel_position[0] + 0.5 * sector.surfel_normal[0]
+    above = Geometry(beside + np.eye(3), np.array([[0, 1, 2]], np.int32), np.ones((1, 3), np.float32), np.zeros((1, 3), np.float32))
+    lamps = SurfelLights(device, sector, ShadowGeometry(lambda _: above, sectors))
+    x, y, z = beside.tolist()
+    lamps.set_static((Lamp("warm-up", "point", (x, y, z), 1.0, range_m=1.0),))
+    return lamps

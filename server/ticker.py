@@ -23,7 +23,7 @@ from gi_core.light_track import LightTrack
 from gi_core.lighting import Lighting
 from gi_core.lights import lamps_on
 from gi_core.live_sector import LiveLight
-from gi_core.live_world import LiveWorld, TickPlayers, TickReport
+from gi_core.live_world import LONG_TICK_MS, LiveWorld, TickPlayers, TickReport
 from gi_core.relight_input import relight_input
 from gi_core.settings import Settings
 from gi_core.user_sky import UserSky
@@ -50,7 +50,6 @@ class Ticker:
         self.stats = TickStats()
         self.tick = -1
         """The last tick that was begun; -1 before the first."""
-        self.lighting: Lighting | None = None
         self.failure: str | None = None
         """Why the world stands still, should it ever."""
         self.listeners: list[Listener] = []
@@ -59,7 +58,9 @@ class Ticker:
         self._worker: Executor = ThreadPoolExecutor(1, thread_name_prefix="lighting")
         self._track = LightTrack(world.dataset.world.location, self._worker, sky)
         self._track.set_weather(state.weather.at)
+        self._lighting: Lighting | None = None
         self._light: LiveLight | None = None
+        """The latest that was made, of this tick or of the next, and what it was made of."""
         self._light_of: tuple[object, ...] = ()
         self._lit_lamps: tuple[object, ...] = ()
         self._lamps_now: tuple[tuple[Lamp, ...], tuple[Lamp, ...]] = ((), ())
@@ -162,6 +163,7 @@ class Ticker:
             left_ms = FILL_UNTIL * period_s * 1e3 - (lit - begun) * 1e3
             report = self.world.tick(number, players, light, self.state.moving_boxes, left_ms)
             report.ms["light"] = (lit - begun) * 1e3
+            self._look_ahead(number + 1, begun)
         except Exception as error:
             # The world goes on: the next tick may do what this one could not.
             self.stats.failed_ticks += 1
@@ -214,16 +216,22 @@ class Ticker:
         try:
             lighting = self._lighting_at(number)
         except UnknownTimeError:
-            if self.lighting is None:
+            if self._lighting is None:
                 raise
-            lighting = self.lighting
+            lighting = self._lighting
         state = self.state
         key = (lighting, state.settings, state.lamps)
         if self._light is None or any(a is not b for a, b in zip(key, self._light_of, strict=True)):
-            self.lighting = lighting
+            self._lighting = lighting
             self._light = self._make_light(lighting, state)
             self._light_of = key
         return self._light
+
+    def _look_ahead(self, number: int, begun: float) -> None:
+        """Make the next tick's light in one that has been short: where it changes, sectors are relit and volumes filled for it as well."""
+        last = self.state.clock.last_tick
+        if (time.perf_counter() - begun) * 1e3 < LONG_TICK_MS and (last is None or number <= last):
+            self._light_at(number)
 
     def _make_light(self, lighting: Lighting, state: LiveState) -> LiveLight:
         settings = state.settings

@@ -574,6 +574,30 @@ def test_warming_up_changes_no_light(world, engine):
     np.testing.assert_array_equal(found, engine.volume(STREET, lighting).values)
 
 
+def test_no_tick_builds_a_kernel_once_warm(engine):
+    dataset = Dataset.open(GOLDEN)
+    world = LiveWorld(dataset)
+    try:
+        world.warm_up()
+        built = world._device.built_kernels
+        run = Run(world)
+        states = [
+            ("12:00", "clear", NEUTRAL),
+            ("12:10", "snow", NEUTRAL),
+            ("21:50", "clear", Settings(bounce_factor=2.0)),
+            ("23:30", "clear", NEUTRAL),
+        ]
+        for time_of_day, weather, settings in states:
+            light = light_of(world, engine.lighting(time_of_day, weather), dataset.world.lamps, settings=settings, standing=False)
+            for step in range(60):
+                run.tick(at(STREET + 0.2 * step * EAST), light)
+                time.sleep(0.002)
+        assert all(sector.is_lit for sector in world.streamer.residents.values())
+        assert world._device.built_kernels == built
+    finally:
+        world.close()
+
+
 def test_warming_up_reads_no_voxel_beyond_the_sector(world, monkeypatch):
     read = []
 
