@@ -15,6 +15,7 @@ anybody's. No file is read and no kernel compiled in it, once ``warm_up`` has ru
 import threading
 import time
 from collections.abc import Collection, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from itertools import product
 
@@ -111,10 +112,9 @@ class LiveWorld:
         self.basis = basis
         self._geometry = ShadowGeometry(dataset.geometry, dataset.world.sectors)
         self._tracing = threading.Lock()
-        self.right_of_way = RightOfWay()
-        """What threads that load and plan give to whoever takes it for a tick."""
+        self._right_of_way = RightOfWay()
         options = stream or StreamOptions(budget_bytes)
-        self.streamer = Streamer(sector_table(dataset.world), dataset.sector, self._place, options, self.right_of_way)
+        self.streamer = Streamer(sector_table(dataset.world), dataset.sector, self._place, options, self._right_of_way)
         self.streamer.lamps_planned = bool(dataset.world.lamps)
         self.volumes = LiveVolumes(self._device, frozenset(dataset.world.sectors), self.streamer.residents, basis)
         self._evicted: tuple[SectorIndex, ...] = ()
@@ -130,7 +130,7 @@ class LiveWorld:
         self._placeholders: dict[SectorIndex, Float32] = {}
         """Of this tick's light."""
         self._texel_of = {index: texel for texel, index in enumerate(self._distant.sectors())}
-        self._shadows = LiveShadows(self._device, dataset, self.right_of_way) if shadow_map else None
+        self._shadows = LiveShadows(self._device, dataset, self._right_of_way) if shadow_map else None
 
     @property
     def device_name(self) -> str:
@@ -188,6 +188,10 @@ class LiveWorld:
             report.evicted = self._evicted = self.plan.evictions
         lap("stream")
         return report
+
+    def undisturbed(self) -> AbstractContextManager[None]:
+        """For a tick: meanwhile threads that load and plan stand still, unless somebody looks at sectors that are not there."""
+        return nullcontext() if self.plan is not None and self.plan.missing else self._right_of_way.taken()
 
     def warm_up(self) -> None:
         """Compile and run every kernel that light may ask for, on the dataset's smallest lit sector: a first run takes seconds, later

@@ -148,7 +148,7 @@ class Ticker:
                 self.stats.skipped += overdue
                 number += overdue
                 due += overdue * period_s
-            with self.world.right_of_way.taken():
+            with self.world.undisturbed():
                 self._tick(number, due, period_s)
             self._running.set()
 

@@ -1,13 +1,13 @@
 """The heartbeat by a clock made by hand: true to real time, one tick at once, every lost tick counted, and volumes shed before light."""
 
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from gi_core.background import RightOfWay
 from gi_core.dataset import Dataset
 from gi_core.live_world import TickReport
 from gi_core.world import Location
@@ -56,7 +56,7 @@ class SlowWorld:
     begun_s: list[float] = field(default_factory=list)
     fill_ms: list[float] = field(default_factory=list)
     is_ticking: bool = False
-    right_of_way: RightOfWay = field(default_factory=RightOfWay)
+    undisturbed: Callable[[], AbstractContextManager[None]] = nullcontext
 
     def tick(self, number: int, players: object, light: object, boxes: object, fill_ms: float) -> TickReport:
         assert not self.is_ticking
