@@ -8,7 +8,7 @@ import numpy as np
 
 from gi_core.arrays import Float32
 
-KEPT = 4  # free ones that are kept: more players at once than these share out what the others return
+KEPT = 8  # free ones that are kept: more players at once than these share out what the others return
 
 
 class RecycledArrays:
