@@ -12,6 +12,9 @@ import numpy as np
 from gi_core.arrays import Float64, Int64
 from gi_core.constants import SECTOR_SIZE_M, VOLUME_SHAPE, VOXEL_SIZE_M
 
+# Voxels along x, y and z on a volume's one side of its middle.
+_HALF_VOLUME = np.array([VOLUME_SHAPE[2], VOLUME_SHAPE[0], VOLUME_SHAPE[1]]) // 2
+
 
 class SectorIndex(NamedTuple):
     """Sector (x, z) covers [64 x, 64 x + 64) by [64 z, 64 z + 64) m in world x and z."""
@@ -53,5 +56,4 @@ def volume_first_voxel(position: Float64, cascade: int = 0) -> Int64:
     The centre of the volume lies within half a voxel of the position along each axis.
     """
     voxel_size = VOXEL_SIZE_M * 2.0**cascade
-    shape_xyz = np.array(VOLUME_SHAPE[::-1])[[0, 2, 1]]  # (y, z, x) -> (x, y, z)
-    return np.asarray(np.round(np.asarray(position, np.float64) / voxel_size) - shape_xyz // 2, np.int64)
+    return np.asarray(np.round(np.asarray(position, np.float64) / voxel_size) - _HALF_VOLUME, np.int64)

@@ -21,10 +21,13 @@ class LightNeeds:
         self._change: Float64 = np.full(sectors, WHOLLY)
         self._numbers: Float64 | None = None
         self._scale: Float64 = np.zeros(sectors)
+        self._light: LightVector | None = None
+        self._moved: Float64 = np.zeros(sectors)
+        """(n,) what ``_light`` has changed since each sector's last relight."""
 
     def forget(self, row: int) -> None:
         """A sector has just arrived: nothing is known of its light."""
-        self.relit_at[row], self.exact[row], self._change[row] = NEVER_RELIT, False, WHOLLY
+        self.relit_at[row], self.exact[row], self._change[row], self._moved[row] = NEVER_RELIT, False, WHOLLY, 0.0
 
     def disturb(self, row: int, change: float) -> None:
         """Something has changed a sector's light by a share of it: a lamp, a look at the shadow map."""
@@ -37,16 +40,19 @@ class LightNeeds:
             self._numbers = np.zeros((len(self._change), len(light.numbers)))
         self._numbers[row], self._scale[row] = light.numbers, light.scale
         self.relit_at[row], self._change[row], self.exact[row] = tick, change, exact
+        self._moved[row] = 0.0
+        if light is not self._light:
+            self._light = None
 
     def changes(self, rows: Int64, light: LightVector) -> Float64:
         """(k,) for some rows: how far each is from its light, by its bounces or by what the light has changed since its last relight.
 
         Rows whose light has changed at all are no longer exact.
         """
-        own = self._change[rows]
-        if self._numbers is None:
-            return own
-        lit = self.relit_at[rows] != NEVER_RELIT
-        moved = np.where(lit, relative_changes(self._numbers[rows], self._scale[rows], light), 0.0)
-        self.exact[rows[moved > 0]] = False
-        return np.maximum(own, moved)
+        if light is not self._light:
+            self._light = light
+            if self._numbers is not None:
+                lit = self.relit_at != NEVER_RELIT
+                self._moved = np.where(lit, relative_changes(self._numbers, self._scale, light), 0.0)
+                self.exact[self._moved > 0] = False
+        return np.maximum(self._change[rows], self._moved[rows])

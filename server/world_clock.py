@@ -10,6 +10,7 @@ old law had gone on is carried over, so that a million changes drift no more tha
 import re
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
+from functools import cached_property
 from typing import Any
 
 from gi_core.clock_time import FIRST_YEAR, LAST_YEAR, local_time, parse_time
@@ -50,7 +51,7 @@ class WorldClock:
         """World seconds that pass in a second of real time when the clock is not paused."""
         return self.rate_millionths / _MILLION
 
-    @property
+    @cached_property
     def last_tick(self) -> int | None:
         """The last tick whose moment is before the end of year 2599; None when the clock stands still. A ticker pauses there."""
         if self._step == 0:
@@ -90,7 +91,7 @@ class WorldClock:
         """What a tick adds, in microseconds / ticks_per_second."""
         return 0 if self.paused else self.rate_millionths
 
-    @property
+    @cached_property
     def _left(self) -> int:
         """Microseconds from ``start`` to the end of the last year, which no moment may reach."""
         # By way of UTC: datetimes of one zone are subtracted as their clocks read, which change twice a year.
