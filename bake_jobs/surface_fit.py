@@ -31,7 +31,7 @@ from gi_core.rooms import rooms_of
 from gi_core.world import Room
 
 # A reader for so much surface where voxels are coarse, and for so much of it where they are half as wide.
-COARSE_AREA_M2, FINE_AREA_M2 = 6.0, 3.0
+COARSE_AREA_M2, FINE_AREA_M2 = 6.0, 1.0
 # A surface reads along its normal. Faces that it turns from count so much, or no light would hold them.
 OTHER_FACES = 0.05
 # Readers that take less than this from the wall do not count, nor do voxels that are read less in all.

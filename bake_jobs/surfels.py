@@ -131,11 +131,12 @@ def cluster(gbuffer: GBuffer, room: UInt16, origin: Float64, albedo: Float32, em
     triangle = gbuffer.hits.triangle[hit]
     mean_normal = mean(normal)
     mean_normal /= np.maximum(np.linalg.norm(mean_normal, axis=1, keepdims=True), 1e-12)
+    position = _on_surface(mean(local), mean_normal, local, of_hit)
     brick_key, first = np.unique(surfel_key >> _BRICK_SHIFT, return_index=True)
     brick_cell = np.stack([brick_key >> 9 & 0xFFFF, brick_key >> 41 & 0x1FFF, brick_key >> 25 & 0xFFFF], axis=1)
     brick_cell -= np.array([_HALF_RANGE, _HALF_HEIGHT, _HALF_RANGE])
     return Surfels(
-        position=mean(local),
+        position=position,
         normal=mean_normal.astype(np.float32),
         albedo=mean(albedo[triangle]).astype(np.float32),
         emission=mean(emission[triangle]).astype(np.float32) if emission.any() else np.zeros((count, 3), np.float32),
@@ -146,6 +147,22 @@ def cluster(gbuffer: GBuffer, room: UInt16, origin: Float64, albedo: Float32, em
         of_hit=of_hit,
         hit=hit,
     )
+
+
+def _on_surface(mean: Float64, normal: Float64, hits: Float64, of_hit: Int64) -> Float64:
+    """Positions (S, 3): the means of hits (h, 3) where these lie in a plane, elsewhere the hits nearest to the means.
+
+    Where walls step back, as at cornices and between piers, the mean of a cell is inside the wall, where neither sun nor lamps come.
+    """
+    off = hits - mean[of_hit]
+    uneven = np.zeros(len(mean), bool)
+    uneven[of_hit[np.abs(np.einsum("ha,ha->h", off, normal[of_hit])) > KEY_OFFSET_M]] = True
+    some = np.flatnonzero(uneven[of_hit])
+    some = some[np.lexsort((np.einsum("ha,ha->h", off[some], off[some]), of_hit[some]))]
+    surfel, first = np.unique(of_hit[some], return_index=True)
+    position = mean.copy()
+    position[surfel] = hits[some[first]]
+    return position
 
 
 def _key(cell: Int64, room: Int64, direction: UInt8, level: Int64) -> Int64:

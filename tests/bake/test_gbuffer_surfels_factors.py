@@ -169,6 +169,18 @@ def test_every_hit_is_in_one_surfel_whose_mean_it_shares(town):
         np.testing.assert_allclose(s.position[surfel], town.seen.position[members].mean(axis=0), atol=1e-9)
 
 
+def test_surfels_of_a_stepped_wall_lie_on_it(build):
+    """Ribs 0.3 m deep and 0.4 m wide on a wall: a cell has hits on ribs and between them, and their mean is in none of both planes."""
+    wall = build().ground().box((20, 0, 0), (30, 12, 40), 0.5)
+    for z in np.arange(0, 40, 0.8):
+        wall.box((19.7, 0, z), (20, 12, z + 0.4), 0.5)
+    s = look(wall.scene(), [[3, 4, 10], [3, 6, 20], [3, 5, 30]], edge=16).surfels
+    facing = s.normal[:, 0] < -0.99
+    assert facing.sum() > 20
+    depth = s.position[facing, 0]
+    assert np.minimum(np.abs(depth - 20), np.abs(depth - 19.7)).max() < 1e-3
+
+
 @pytest.mark.parametrize("k", [1, 3])
 def test_feedback_comes_from_the_closest_probes_that_see_the_surfel(town, k):
     probe, weight = surfels.feedback(town.surfels, town.seen, k)
