@@ -54,7 +54,7 @@ from gi_core.sector import Sector
 from gi_core.sun_table import SunTable
 
 # Part of the bake id: raised whenever the same settings would give other bytes than before.
-BAKER_VERSION = 6
+BAKER_VERSION = 7
 SectorRange = tuple[tuple[int, int], tuple[int, int]]
 
 
