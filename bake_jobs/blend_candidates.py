@@ -30,6 +30,13 @@ def kept_at_border(centre: Float64, probes: Float64, margin_m: float) -> Float64
     return np.asarray(np.where(held_by_both, 1, share).prod(axis=2))
 
 
+def held_at_border(centre: Float64, probes: Float64, margin_m: float) -> Bool:
+    """(V, c) bool: whether all sectors at border lines within the margin of voxels (V, 3) hold candidates (V, c, 3)."""
+    line = np.round(centre[:, [0, 2]] / SECTOR_SIZE_M) * SECTOR_SIZE_M
+    held = np.abs(probes[:, :, [0, 2]] - line[:, None]) < margin_m
+    return np.asarray((held | (to_border(centre) >= margin_m)[:, None]).all(axis=2))
+
+
 def visible(ray_scene: RayScene, centre: Float64, probes: Float64, distance: Float64) -> Bool:
     """(V, c) bool: nothing lies between each voxel centre (V, 3) and its candidates (V, c, 3)."""
     voxels, candidates = distance.shape

@@ -17,6 +17,7 @@ KNOB_CHOICES: dict[str, tuple[str, ...]] = {
     "placement": ("grid", "adaptive"),
     "voxel_weights": ("nearest", "fitted"),
     "wall_weights": ("nearest", "fitted"),
+    "far_feedback": ("closest", "likest"),
 }
 # What a knob may be where it is not any length, angle or number of 0.01 to 10 000.
 KNOB_RANGES = {
@@ -59,6 +60,8 @@ class BakeSettings:
     voxel_candidates : nearest probes that are tested for visibility from a voxel
     voxel_levels : 1, the talk's voxels of 3.125 m; 2, near surfaces also some of half that, for volumes of cascade -1
     feedback_probes : probes that light a surfel, the closest of those that see it; more: smoother bounces, more to do at each relight
+    far_feedback : what lights surfels far from all probes, "closest", the closest that sees them, as near ones; "likest", that whose trial
+        light is likest, where voxel weights are fitted too (bake_jobs/far_feedback.py)
     placement : "grid", ground grid and walls; "adaptive", where light changes (bake_jobs/adaptive.py)
     voxel_weights : "nearest", visible probes by distance; "fitted", to trial light (bake_jobs/fit.py)
     wall_weights : of voxels in walls, "nearest", those of the nearest air; "fitted", to what surfaces that read them need, where voxel
@@ -95,6 +98,7 @@ class BakeSettings:
     voxel_candidates: int = 8
     voxel_levels: int = 1
     feedback_probes: int = 1
+    far_feedback: str = "closest"
     placement: str = "grid"
     voxel_weights: str = "nearest"
     wall_weights: str = "nearest"
@@ -121,6 +125,8 @@ class BakeSettings:
             del knobs["voxel_levels"]
         if "nearest" in (self.wall_weights, self.voxel_weights):
             del knobs["wall_weights"]
+        if self.far_feedback == "closest" or self.voxel_weights == "nearest":
+            del knobs["far_feedback"]
         if not self.reader_probes:
             del knobs["reader_probes"]
         return knobs
@@ -155,6 +161,7 @@ ADAPTIVE: dict[str, Any] = {
     "placement": "adaptive",
     "voxel_weights": "fitted",
     "wall_weights": "fitted",
+    "far_feedback": "likest",
     "voxel_candidates": 24,
     "margin_m": 3.2,
 }

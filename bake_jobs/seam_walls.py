@@ -85,7 +85,10 @@ def find_walls(dataset: Dataset) -> Walls:
         for axis, before in ((0, SectorIndex(index.x - 1, index.z)), (2, SectorIndex(index.x, index.z - 1))):
             if before in dataset.world.sectors:
                 found.append(across(rays, index.origin, low, axis))
-    walls = Walls(*(np.concatenate([part[n] for part in found]) for n in range(3)))
+    middle, normal, along = (np.concatenate([part[n] for part in found]) for n in range(3))
+    # A ray along a border line goes on past the sector that it starts in: several find the same wall.
+    _, first = np.unique(np.round(middle, 2), axis=0, return_index=True)
+    walls = Walls(middle[first], normal[first], along[first])
     if not len(walls.middle):
         raise InputError(f"{dataset.path}: expected a flat wall of {len(WINDOWS) * WINDOW_M:.0f} m across a border of sectors, found none")
     return walls
@@ -104,9 +107,8 @@ def across(rays: RayScene, origin: Float64, low_m: float, axis: int) -> tuple[Fl
     # Seen from its front: a ray that starts in a building meets walls from behind.
     wall = hits.hit & ~hits.from_back & (np.abs(hits.normal[:, 1]) < 0.01) & (np.abs(hits.normal[:, other]) > LEAST_ACROSS)
     middle = start[wall] + way[wall] * hits.distance[wall, None]
-    normal = hits.normal[wall].astype(np.float64)
-    _, first = np.unique(np.round(middle).astype(np.int64), axis=0, return_index=True)
-    middle, normal = middle[first], normal[first]
+    _, first = np.unique(np.round(middle, 2), axis=0, return_index=True)
+    middle, normal = middle[first], hits.normal[wall][first].astype(np.float64)
     along = np.cross(normal, [0.0, 1.0, 0.0])
     flat = _is_flat(rays, middle, normal, along) if len(middle) else np.zeros(0, bool)
     return middle[flat], normal[flat], along[flat]

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from bake_jobs import adaptive, factors, fine_voxels, gbuffer, placement, sun_visibility, surfels, voxels
+from bake_jobs import adaptive, factors, far_feedback, fine_voxels, gbuffer, placement, sun_visibility, surfels, voxels
 from bake_jobs.air import find_air
 from bake_jobs.config import BakeSettings
 from bake_jobs.distant_transfer import TransferBaker, of_texel
@@ -124,6 +124,10 @@ class SectorBaker:
         clustered = surfels.cluster(seen, room, index.origin, scene.albedo, scene.emission, settings.cells_double_beyond_m)
         weights = factors.gather(seen, self._pattern, clustered, None if settings.sky == "faces" else settings.sky_patches)
         feedback_probe, feedback_weight = surfels.feedback(clustered, seen, settings.feedback_probes)
+        if settings.far_feedback == "likest" and trial is not None and self.trial is not None:
+            lights = (feedback_probe, feedback_weight)
+            lights = far_feedback.likest_where_far(clustered, seen, room, placed, trial, self.trial, *lights)
+            feedback_probe, feedback_weight = lights
         surface_fit = self._surface_fit(index, geometry, placed, trial)
         lattice = voxels.bake_voxels(rays, self._solids, _surfaces(geometry), index, placed, settings, scene.rooms, trial, surface_fit)
         emits = bool(clustered.emission.any())

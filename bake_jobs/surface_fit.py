@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from bake_jobs.adaptive import DARK, DARK_LAMPLIGHT_LX, Trial
-from bake_jobs.blend_candidates import LEAST_DISTANCE_M, kept_at_border, visible
+from bake_jobs.blend_candidates import LEAST_DISTANCE_M, held_at_border, kept_at_border, visible
 from bake_jobs.config import BakeSettings
 from bake_jobs.distinct import distinct
 from bake_jobs.fit import fit_weights
@@ -186,6 +186,9 @@ class SurfaceFit:
         voxel, probe = np.divmod(pair, len(position))
         closeness = kept_at_border(centre[voxel], position[probe][:, None], self._settings.margin_m)[:, 0]
         closeness *= np.bincount(of_pair, (share[:, None] * close[reader]).reshape(-1), len(pair))
+        held = held_at_border(centre[voxel], position[probe][:, None], self._settings.margin_m)[:, 0]
+        some_held = np.bincount(voxel, (closeness > 0) & held, count) > 0
+        closeness[some_held[voxel] & ~held] = 0
         order = np.lexsort((probe, -closeness, voxel))
         voxel, probe, closeness = voxel[order], probe[order], closeness[order]
         rank = np.arange(len(voxel)) - np.searchsorted(voxel, voxel)

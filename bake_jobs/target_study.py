@@ -1,6 +1,8 @@
 """Is a bake's own estimate of its error to be believed? Sectors baked for several target errors, beside the path tracer.
 
-    python -m bake_jobs.target_study SOURCE X0:X1,Z0:Z1 OUTDIR     a table on stdout
+    python -m bake_jobs.target_study SOURCE X0:X1,Z0:Z1 OUTDIR [POINTS [bake]]     a table on stdout
+
+POINTS voxels a sector are measured, 60 if no number is given. What OUTDIR has of an earlier run is not baked again, for 0 core seconds.
 
 interpolation  by the bake: median over faces of trial lights that no probe was placed and no weight fitted for, at voxels near surfaces
 blended        the same by the path tracer: traced at the probes, blended by the baked weights, beside traced at voxels near surfaces
@@ -8,7 +10,8 @@ estimate       by the bake: what it measured at a few voxels (bake_jobs/served_e
 own            by the bake: what the estimate has over interpolation, in squares
 served         those voxels in a volume, with the light that the bake's own sources and bounces give its probes, beside the same
 
-Blended and served are measured under suns that are none of the bake's; the first line says how far off the nearest that it tried stands.
+Blended and served are measured under suns that are none of the bake's, or, where the last word is ``bake``, under the very ones that it
+measured under; the first line says how far off the nearest that it tried stands.
 """
 
 import re
@@ -27,6 +30,7 @@ from bake_jobs.config import settings_for
 from bake_jobs.path_tracer import Estimate, PathTracer
 from bake_jobs.runner import SectorRange, bake
 from bake_jobs.scene_source import load_scene
+from bake_jobs.served_error import MOMENTS
 from bake_jobs.trial_states import trial_states
 from gi_core.arrays import AnyArray, Float64
 from gi_core.basis import conversion
@@ -35,10 +39,12 @@ from gi_core.engine import Engine
 from gi_core.errors import InputError
 from gi_core.grid import volume_first_voxel, voxel_centre
 from gi_core.lighting import Lighting
+from gi_core.lighting_model import make_lighting
 from gi_core.lights import lamps_on
 from gi_core.sector import Sector
 from gi_core.sector_file import read
 from gi_core.sun_table import SunTable
+from gi_core.world import Location
 
 PRESET = "standard"
 TARGETS = (0.10, 0.05, 0.03)
@@ -74,14 +80,16 @@ class Measured:
 def main(arguments: Sequence[str]) -> None:
     """The command line that the module's docstring shows."""
     match arguments:
-        case [source, area, output] if found := re.fullmatch(r"(-?\d+):(-?\d+),(-?\d+):(-?\d+)", area):
-            x0, x1, z0, z1 = map(int, found.groups())
-            print_table(source, ((x0, x1), (z0, z1)), Path(output))
+        case [source, area, output, *rest] if found := re.fullmatch(
+            r"(-?\d+):(-?\d+),(-?\d+):(-?\d+)( [1-9]\d*)?( bake)?", " ".join([area, *rest])
+        ):
+            x0, x1, z0, z1 = map(int, found.groups()[:4])
+            print_table(source, ((x0, x1), (z0, z1)), Path(output), int(found[5] or POINTS), found[6] is not None)
         case _:
             raise SystemExit(__doc__)
 
 
-def print_table(source: str, sectors: SectorRange, output: Path) -> None:
+def print_table(source: str, sectors: SectorRange, output: Path, points: int, bakes_suns: bool) -> None:
     """One row per target, medians in per cent; of what is measured, where it lies with 95 % confidence, the tracer's noise taken off."""
     scene = load_scene(source)
     tracer = PathTracer(scene.vertices, scene.triangles, scene.albedo, scene.emission)
@@ -93,24 +101,25 @@ def print_table(source: str, sectors: SectorRange, output: Path) -> None:
         bake(source, folder, PRESET, 1, sectors, console=console, target_error=target, on_baked=seconds.append)
         dataset = Dataset.open(folder)
         if number == 0:
-            lightings = _lightings(Engine(dataset))
+            lightings = _lightings(dataset.world.location, bakes_suns)
             print("; ".join(f"{name}: {nearest_trial_sun(dataset, light):.0f} degrees" for name, light in lightings.items()))
             print(f"\n| {' | '.join(COLUMNS)} |\n{'|---' * len(COLUMNS)}|")
-        found = measure(dataset, tracer, known)
+        found = measure(dataset, tracer, known, points, lightings)
         estimate, own = np.array(found.estimates), np.array(found.own)
         low, high = _interval(found.served)
-        cells = [f"{100 * target:.0f}", f"{np.mean(found.probes):.0f}", f"{np.mean(seconds):.1f}", f"{(estimate > target).sum()}"]
+        cells = [f"{100 * target:.0f}", f"{np.mean(found.probes):.0f}", f"{np.mean(seconds or [0.0]):.1f}", f"{(estimate > target).sum()}"]
         cells += [f"{100 * np.median(error):.1f}" for error in (np.sqrt(estimate**2 - own**2), own, estimate)]
         cells += [f"{_text(_interval(found.blended))}", f"{_text((low, high))}", f"{(low + high) / 2 / np.median(estimate):.2f}"]
         cells += [" ".join(f"{100 * e:.1f}:{50 * sum(_interval(s)):.1f}" for e, s in zip(estimate, found.each, strict=True))]
         print(f"| {' | '.join(cells)} |", flush=True)
 
 
-def measure(dataset: Dataset, tracer: PathTracer, known: dict[bytes, list[Estimate]]) -> Measured:
-    """All sectors of a dataset that have probes, in STATES. known : as ``compare.Reference`` has it"""
+def measure(
+    dataset: Dataset, tracer: PathTracer, known: dict[bytes, list[Estimate]], points: int, lightings: dict[str, Lighting]
+) -> Measured:
+    """All sectors of a dataset that have probes. known : as ``compare.Reference`` has it; points : voxels of a sector at most"""
     engine, found = Engine(dataset), Measured()
     basis = dataset.world.basis
-    lightings = _lightings(engine)
     for index, facts in sorted(dataset.world.sectors.items()):
         if not facts.probes:
             continue
@@ -120,8 +129,8 @@ def measure(dataset: Dataset, tracer: PathTracer, known: dict[bytes, list[Estima
             found.estimates.append(facts.estimated_error)
             found.own.append(read(dataset.sector_path(index))[1]["own_error"])
             found.each.append(served)
-        sector, points = dataset.sector(index), points_of(tracer, dataset, index, POINTS, 0)
-        lattice = points.near[:, [2, 0, 1]] + volume_first_voxel(points.eye)
+        sector, chosen = dataset.sector(index), points_of(tracer, dataset, index, points, 0)
+        lattice = chosen.near[:, [2, 0, 1]] + volume_first_voxel(chosen.eye)
         at = lattice - sector.voxel_first
         own = ((at >= 0) & (at < np.array(sector.voxel_class.shape)[[2, 0, 1]])).all(axis=1)
         for lighting in lightings.values():
@@ -131,8 +140,8 @@ def measure(dataset: Dataset, tracer: PathTracer, known: dict[bytes, list[Estima
             probes = reference.cubes(sector.probe_position.astype(np.float64) + index.origin)
             mean, noise = blend(sector, at[own], probes)
             found.blended.add(mean, Estimate(truth.mean, np.hypot(truth.standard_error, noise)))
-            y, z, x = points.near[own].T
-            light = engine.volume(points.eye, lighting).values[:, y, z, x]
+            y, z, x = chosen.near[own].T
+            light = engine.volume(chosen.eye, lighting).values[:, y, z, x]
             for samples in (found.served, served):
                 samples.add(np.einsum("fb,bnc->nfc", conversion(basis, "cube"), light), truth)
     return found
@@ -154,8 +163,10 @@ def nearest_trial_sun(dataset: Dataset, lighting: Lighting) -> float:
     return float(np.degrees(np.arccos((suns @ np.asarray(lighting.sun.direction)).max())))
 
 
-def _lightings(engine: Engine) -> dict[str, Lighting]:
-    return {state.name: engine.lighting(state.time, state.weather) for state in parse_states(STATES, engine.dataset.world.location)}
+def _lightings(location: Location, bakes_suns: bool) -> dict[str, Lighting]:
+    if bakes_suns:
+        return {moment: make_lighting(location, moment) for moment in MOMENTS}
+    return {state.name: make_lighting(location, state.time, state.weather) for state in parse_states(STATES, location)}
 
 
 def _interval(samples: StageSamples) -> tuple[float, float]:

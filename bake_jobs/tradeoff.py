@@ -38,7 +38,7 @@ KNOBS: dict[str, tuple[str, ...]] = {
     "placement": ("placement=grid",),
     "spacing": ("probe_worth=0.03", "probe_worth=0.003", "target_error=0.05", "target_error=0.02"),
     "sky": ("sky=faces", "sky_patches=24", "sky_patches=48"),
-    "feedback": ("feedback_probes=3",),
+    "feedback": ("feedback_probes=3", "far_feedback=closest"),
     "basis": ("basis=cube", "basis=sh1"),
     "voxels": ("voxel_weights=nearest", "wall_weights=nearest", "voxel_probes=2", "voxel_levels=2"),
     "sun": ("sun_hour_step_degrees=7.5",),
@@ -52,6 +52,7 @@ IDEA_KNOBS: tuple[tuple[str, ...], ...] = (
     ("placement=adaptive", "margin_m=3.2"),
     ("voxel_weights=fitted", "voxel_candidates=24"),
     ("voxel_weights=fitted", "voxel_candidates=24", "wall_weights=fitted"),
+    ("voxel_weights=fitted", "voxel_candidates=24", "far_feedback=likest"),
     ("feedback_probes=3",),
 )
 

@@ -81,6 +81,27 @@ class TrialScene:
         cells = self._lit(unique, known)
         return TrialLight(self._gather(of_ray.reshape(keys.shape), keys < 0, cells.exitance), clearance, cells)
 
+    def around(self, start: Float64, normal: Float32) -> Float32:
+        """(k, S): the sky, and what surfaces around send on of sun and sky; from START_M off a surface (k, 3) [m] with normals (k, 3)."""
+        states, rays = self.states, BOUNCE_RAYS
+        directions = _turned(self._bounce, normal).reshape(-1, 3)
+        origins = np.repeat(start, rays, axis=0)
+        hits = self._rays.closest(origins, directions)
+        of_sky = np.zeros((len(start) * rays, states.count), np.float32)
+        of_sky[~hits.hit] = states.sky_radiance(directions[~hits.hit])
+        sky = of_sky.reshape(len(start), rays, states.count).sum(axis=1) * np.float32(np.pi / rays)
+        openness = 1 - hits.hit.reshape(len(start), rays).mean(axis=1, dtype=np.float32)
+        met = np.flatnonzero(hits.hit)
+        at = origins[met] + directions[met] * (hits.distance[met, None] - SURFACE_OFFSET_M)
+        albedo = self._albedo[hits.triangle[met]]
+        sunlit = self._suns(at, hits.normal[met]) @ states.sun_irradiance
+        of_cell = met // rays
+        # What it meets sees about as much sky as it does itself, and later bounces lose what leaves through that opening.
+        onward = albedo[:, None] * (sunlit + sky[of_cell]) / (1 - albedo * (1 - openness[of_cell]))[:, None]
+        bounced = np.zeros((len(start) * rays, states.count), np.float32)
+        bounced[met] = onward
+        return sky + bounced.reshape(len(start), rays, states.count).mean(axis=1)
+
     def _lit(self, keys: Int64, known: Cells | None) -> Cells:
         if known is None or not len(known.key):
             return Cells(keys, self._exitance(keys))
@@ -119,7 +140,7 @@ class TrialScene:
         lamp_states = np.flatnonzero(states.lamps)
         if len(lamp_states):
             direct[:, lamp_states] += self._lamplight(start, normal)[:, None]
-        arriving = direct + self._from_around(start, normal)
+        arriving = direct + self.around(start, normal)
         found = np.zeros((len(keys), states.count), np.float32)
         found[~is_sky] = albedo[:, None] * arriving
         if len(lamp_states):
@@ -148,27 +169,6 @@ class TrialScene:
         blocked = self._rays.occluded_from(self._rays.local(start).take(cell, axis=0), directions.take(sun, axis=0))
         cosine[cell[blocked], sun[blocked]] = 0
         return cosine
-
-    def _from_around(self, start: Float64, normal: Float32) -> Float32:
-        """(k, S): sky, and what surfaces around send on of sun and sky."""
-        states, rays = self.states, BOUNCE_RAYS
-        directions = _turned(self._bounce, normal).reshape(-1, 3)
-        origins = np.repeat(start, rays, axis=0)
-        hits = self._rays.closest(origins, directions)
-        of_sky = np.zeros((len(start) * rays, states.count), np.float32)
-        of_sky[~hits.hit] = states.sky_radiance(directions[~hits.hit])
-        sky = of_sky.reshape(len(start), rays, states.count).sum(axis=1) * np.float32(np.pi / rays)
-        openness = 1 - hits.hit.reshape(len(start), rays).mean(axis=1, dtype=np.float32)
-        met = np.flatnonzero(hits.hit)
-        at = origins[met] + directions[met] * (hits.distance[met, None] - SURFACE_OFFSET_M)
-        albedo = self._albedo[hits.triangle[met]]
-        sunlit = self._suns(at, hits.normal[met]) @ states.sun_irradiance
-        of_cell = met // rays
-        # What it meets sees about as much sky as it does itself, and later bounces lose what leaves through that opening.
-        onward = albedo[:, None] * (sunlit + sky[of_cell]) / (1 - albedo * (1 - openness[of_cell]))[:, None]
-        bounced = np.zeros((len(start) * rays, states.count), np.float32)
-        bounced[met] = onward
-        return sky + bounced.reshape(len(start), rays, states.count).mean(axis=1)
 
     def _lamplight(self, start: Float64, normal: Float32) -> Float32:
         """(k,): all lamps, each shadowed by one ray to its middle."""

@@ -17,7 +17,7 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
 from bake_jobs.adaptive import Trial
-from bake_jobs.blend_candidates import FADE_M, LEAST_DISTANCE_M, kept_at_border, to_border, visible
+from bake_jobs.blend_candidates import FADE_M, LEAST_DISTANCE_M, held_at_border, kept_at_border, to_border, visible
 from bake_jobs.config import BakeSettings
 from bake_jobs.inside import Solids
 from bake_jobs.placement import Placement
@@ -146,6 +146,9 @@ def blend(
             closest = np.argsort(-closeness, axis=1, kind="stable")[:, :k]
             share[rows, closest] = closeness[rows, closest]
             if fit is not None:
+                # A fit heeds little how close probes are: what one sector alone holds is kept from it, where it sees anything else.
+                held = held_at_border(centre[some], placement.position[near], settings.margin_m)
+                closeness[((closeness > 0) & held).any(axis=1, keepdims=True) & ~held] = 0
                 share = fit.shares(some, near, closeness, share)
             best = np.argsort(-share, axis=1, kind="stable")[:, :k]
             probe[some, : best.shape[1]] = near[rows, best]

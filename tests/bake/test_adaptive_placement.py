@@ -91,6 +91,26 @@ def test_margin_probes_are_the_neighbours_own(west_and_east):
     assert strips[0] == strips[1]
 
 
+def test_fitted_voxels_at_a_border_blend_what_both_sectors_hold(west_and_east):
+    """Voxels of the air in the columns beside the border."""
+    bench, _ = west_and_east
+    shared = []
+    for x in (0, 1):
+        index = SectorIndex(x, 0)
+        sector, _ = bench.bake_arrays(index, bench.cutter.cut(index))
+        low = -sector.voxel_first[1]
+        column = sector.voxel_class.shape[2] - 1 if x == 0 else 0
+        assert abs(voxel_centre(sector.voxel_first[0] + column) - 64) < 3.2
+        rows = slice(low, low + 6), slice(2, -2), column
+        held = np.abs(sector.probe_position[:, 0] + index.origin[0] - 64) < 3.2
+        weight = np.where(held[sector.voxel_probe[rows]], sector.voxel_weight[rows], 0).sum(axis=2)
+        shared.append(weight[sector.voxel_class[rows] == VOXEL_OUTDOORS])
+    found = np.concatenate(shared)
+    # Where the fit alone decided, a sixth of them blended others, up to 40 %.
+    assert len(found) > 100
+    assert found.min() > 0.999
+
+
 @pytest.mark.slow
 def test_no_seam_shows(west_and_east):
     """Steps between voxels on both sides of the border are no higher than those of the light itself."""

@@ -16,7 +16,8 @@ def test_a_knob_changes_one_setting_and_the_name():
 
 
 def test_standard_is_the_talk_and_its_ideas():
-    placed = ["placement=adaptive", "voxel_weights=fitted", "wall_weights=fitted", "voxel_candidates=24", "margin_m=3.2"]
+    placed = ["placement=adaptive", "voxel_weights=fitted", "wall_weights=fitted", "far_feedback=likest"]
+    placed += ["voxel_candidates=24", "margin_m=3.2"]
     ideas = with_knobs(settings_for("talk"), ["basis=sh2", "sky=patches", "sky_patches=96", "cells_double_beyond_m=4", *placed]).to_json()
     assert settings_for("standard").to_json() | {"preset": ""} == ideas | {"preset": ""}
 
@@ -37,6 +38,7 @@ def test_reference_is_standard_and_more_of_it():
         ("placement=random", "expected grid or adaptive"),
         ("voxel_weights=1", "expected nearest or fitted"),
         ("wall_weights=none", "expected nearest or fitted"),
+        ("far_feedback=none", "expected closest or likest"),
         ("sky_patches=2", "expected 4 to 1024"),
         ("feedback_probes=33", "expected 1 to 32"),
         ("voxel_levels=3", "expected 1 to 2"),
@@ -59,4 +61,5 @@ def test_a_knob_that_does_nothing_is_not_part_of_a_bake():
     assert settings_for("talk").sky_sources == 6
     assert "voxel_levels" not in settings_for("standard").to_json()
     assert "wall_weights" not in settings_for("talk").to_json()
+    assert "far_feedback" not in with_knobs(settings_for("talk"), ["far_feedback=likest"]).to_json()
     assert {settings_for(name).preset for name in PRESETS} == set(PRESETS)
