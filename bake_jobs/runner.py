@@ -14,11 +14,12 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
@@ -332,6 +333,26 @@ def _interrupts_held() -> Iterator[None]:
 
 
 @contextmanager
+def _interrupts_into(queue: "SimpleQueue[Any]") -> Iterator[None]:
+    """Ctrl-C, and what else would raise KeyboardInterrupt, comes as None out of a queue instead.
+
+    Raised while the main thread takes the lock of a future, it would leave that locked, and a bake that shuts its workers down would wait
+    for it for ever.
+    """
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    if threading.current_thread() is not threading.main_thread():
+        handlers = {}  # they are not this thread's to set
+    ours = [number for number, handler in handlers.items() if handler is signal.default_int_handler]
+    try:
+        for number in ours:
+            signal.signal(number, lambda *_: queue.put(None))
+        yield
+    finally:
+        for number in ours:
+            signal.signal(number, signal.default_int_handler)
+
+
+@contextmanager
 def _one_thread_each() -> Iterator[None]:
     """Processes that start in this block work out matrix products alone, unless the environment says otherwise.
 
@@ -388,24 +409,25 @@ def _run(
             initializer=_start_worker,
             initargs=(arrays_path, empty, settings, table, bake_id, output),
         )
-        queue = iter(tasks)
-        pending: set[Future[_Finished]] = set()
-        try:
-            # A few tasks ahead of the workers, so that an interrupt has little to wait for.
-            for task in queue:
-                with _interrupts_held():
-                    pending.add(pool.submit(_finish, *task))
-                if len(pending) < 2 * workers:
-                    continue
-                finished, pending = wait(pending, return_when=FIRST_COMPLETED)
-                yield from (future.result() for future in finished)
-            while pending:
-                finished, pending = wait(pending, return_when=FIRST_COMPLETED)
-                yield from (future.result() for future in finished)
-        except BrokenProcessPool as error:
-            raise WorkerLostError(
-                "a worker process was killed, most likely for want of memory; finished sectors are kept: "
-                "start the same bake again with fewer --jobs"
-            ) from error
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
+        done: SimpleQueue[Future[_Finished] | None] = SimpleQueue()
+        pending = 0
+        with _interrupts_into(done):
+            try:
+                for number, task in enumerate(tasks, 1):
+                    with _interrupts_held():
+                        pool.submit(_finish, *task).add_done_callback(done.put)
+                    pending += 1
+                    # A few tasks ahead of the workers, so that an interrupt has little to wait for.
+                    while pending == 2 * workers or (number == len(tasks) and pending):
+                        finished = done.get()
+                        if finished is None:
+                            raise KeyboardInterrupt
+                        pending -= 1
+                        yield finished.result()
+            except BrokenProcessPool as error:
+                raise WorkerLostError(
+                    "a worker process was killed, most likely for want of memory; finished sectors are kept: "
+                    "start the same bake again with fewer --jobs"
+                ) from error
+            finally:
+                pool.shutdown(wait=True, cancel_futures=True)
