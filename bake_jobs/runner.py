@@ -339,10 +339,9 @@ def _interrupts_into(queue: "SimpleQueue[Any]") -> Iterator[None]:
     Raised while the main thread takes the lock of a future, it would leave that locked, and a bake that shuts its workers down would wait
     for it for ever.
     """
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    if threading.current_thread() is not threading.main_thread():
-        handlers = {}  # they are not this thread's to set
-    ours = [number for number, handler in handlers.items() if handler is signal.default_int_handler]
+    # Handlers are the main thread's to set.
+    numbers = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
+    ours = [number for number in numbers if signal.getsignal(number) is signal.default_int_handler]
     try:
         for number in ours:
             signal.signal(number, lambda *_: queue.put(None))
@@ -386,6 +385,14 @@ def _finish(index: SectorIndex, baked_earlier: _Finished | None) -> _Finished:
     return _Finished(index, facts, baked.meta["distant_sky"], time.process_time() - started, baked.transfer, baked.meta.get("own_error"))
 
 
+def _next_finished(done: "SimpleQueue[Future[_Finished] | None]") -> _Finished:
+    """Waits for it. Raises KeyboardInterrupt for one that came meanwhile, and what the worker raised."""
+    future = done.get()
+    if future is None:
+        raise KeyboardInterrupt
+    return future.result()
+
+
 def _run(
     scene: Scene,
     settings: BakeSettings,
@@ -413,17 +420,16 @@ def _run(
         pending = 0
         with _interrupts_into(done):
             try:
-                for number, task in enumerate(tasks, 1):
+                # A few tasks ahead of the workers, so that an interrupt has little to wait for.
+                for task in tasks:
                     with _interrupts_held():
                         pool.submit(_finish, *task).add_done_callback(done.put)
                     pending += 1
-                    # A few tasks ahead of the workers, so that an interrupt has little to wait for.
-                    while pending == 2 * workers or (number == len(tasks) and pending):
-                        finished = done.get()
-                        if finished is None:
-                            raise KeyboardInterrupt
+                    if pending == 2 * workers:
+                        yield _next_finished(done)
                         pending -= 1
-                        yield finished.result()
+                for _ in range(pending):
+                    yield _next_finished(done)
             except BrokenProcessPool as error:
                 raise WorkerLostError(
                     "a worker process was killed, most likely for want of memory; finished sectors are kept: "

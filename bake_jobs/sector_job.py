@@ -125,9 +125,9 @@ class SectorBaker:
         weights = factors.gather(seen, self._pattern, clustered, None if settings.sky == "faces" else settings.sky_patches)
         feedback_probe, feedback_weight = surfels.feedback(clustered, seen, settings.feedback_probes)
         if settings.far_feedback == "likest" and trial is not None and self.trial is not None:
-            lights = (feedback_probe, feedback_weight)
-            lights = far_feedback.likest_where_far(clustered, seen, room, placed, trial, self.trial, *lights)
-            feedback_probe, feedback_weight = lights
+            feedback_probe, feedback_weight = far_feedback.likest_where_far(
+                clustered, seen, room, placed, trial, self.trial, feedback_probe, feedback_weight
+            )
         surface_fit = self._surface_fit(index, geometry, placed, trial)
         lattice = voxels.bake_voxels(rays, self._solids, _surfaces(geometry), index, placed, settings, scene.rooms, trial, surface_fit)
         emits = bool(clustered.emission.any())

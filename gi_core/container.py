@@ -122,7 +122,7 @@ def decode(data: bytes, kind: str, version: int | tuple[int, ...], where: str) -
         raw = _decompress(payload, raw_bytes)
         if not isinstance(parsed["meta"], dict):
             raise CorruptFileError(f"{where}: expected meta to be an object; bake it again")
-        return Container(parsed["meta"], _read_arrays(parsed["arrays"], raw, raw_bytes, where), found_version)
+        return Container(parsed["meta"], _read_arrays(parsed["arrays"], raw, where), found_version)
     except (zstandard.ZstdError, ValueError, KeyError, TypeError, RecursionError) as error:
         if isinstance(error, CorruptFileError):
             raise
@@ -203,9 +203,9 @@ def _unpack(raw: memoryview, dtype: "np.dtype[Any]", shape: tuple[int, ...], del
     return values
 
 
-def _read_arrays(table: list[dict[str, Any]], raw: bytearray, raw_bytes: int, where: str) -> dict[str, AnyArray]:
-    if len(raw) != raw_bytes or len(table) > MAX_ARRAYS:
-        raise CorruptFileError(f"{where}: expected {raw_bytes} bytes in at most {MAX_ARRAYS} arrays, found {len(raw)} in {len(table)}")
+def _read_arrays(table: list[dict[str, Any]], raw: bytearray, where: str) -> dict[str, AnyArray]:
+    if len(table) > MAX_ARRAYS:
+        raise CorruptFileError(f"{where}: expected at most {MAX_ARRAYS} arrays, found {len(table)}")
     arrays: dict[str, AnyArray] = {}
     offset = 0
     for entry in table:
@@ -221,10 +221,10 @@ def _read_arrays(table: list[dict[str, Any]], raw: bytearray, raw_bytes: int, wh
         # An axis of length 0 must not hide lengths that what is computed from the array would have.
         if math.prod(max(n, 1) for n in shape) > MAX_RAW_BYTES:
             raise CorruptFileError(f"{where}: array {name!r} has shape {shape!r}")
-        if offset + size > raw_bytes:
+        if offset + size > len(raw):
             raise CorruptFileError(f"{where}: array {name!r} ends beyond the data")
         arrays[name] = _unpack(memoryview(raw)[offset : offset + size], dtype, tuple(shape), delta)
         offset += size
-    if offset != raw_bytes:
-        raise CorruptFileError(f"{where}: {raw_bytes - offset} bytes belong to no array")
+    if offset != len(raw):
+        raise CorruptFileError(f"{where}: {len(raw) - offset} bytes belong to no array")
     return arrays

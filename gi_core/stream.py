@@ -112,7 +112,7 @@ class Streamer:
     @property
     def is_overfull(self) -> bool:
         """Whether sectors take more than the budget, since one has turned out larger: the next step must make them fit."""
-        return self.resident_bytes + int(self.table.bytes[self._state.loading].sum()) > self._options.budget_bytes
+        return self._state.used_bytes(self.table) > self._options.budget_bytes
 
     def take_over(self) -> list[SectorIndex]:
         """Make resident what loaders have finished; those sectors. Failures are noted, to be tried again later."""

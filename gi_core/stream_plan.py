@@ -57,6 +57,10 @@ class StreamState:
     loading: Bool
     retry_at_s: Float64
 
+    def used_bytes(self, table: SectorTable) -> int:
+        """What counts against the budget: resident sectors and those that load."""
+        return int(self.resident_bytes.sum()) + int(table.bytes[self.loading].sum())
+
     @classmethod
     def empty(cls, table: SectorTable) -> "StreamState":
         """Nothing resident, nothing loading."""
@@ -101,9 +105,8 @@ def plan_streaming(
         keep_margin_m=options.keep_margin_m,
     )
     resident = state.resident_bytes > 0
-    used = int(state.resident_bytes.sum()) + int(table.bytes[state.loading].sum())
     wanted = np.flatnonzero(np.isfinite(needs.ahead_s) & ~resident & ~state.loading & (state.retry_at_s <= now_s))
-    room = _Room(table, state.resident_bytes, needs, positions, options, options.budget_bytes - used)
+    room = _Room(table, state.resident_bytes, needs, positions, options, options.budget_bytes - state.used_bytes(table))
     room.shrink_to_budget()
     slots = options.max_loading - int(np.count_nonzero(state.loading))
     loads: list[int] = []
