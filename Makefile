@@ -5,6 +5,8 @@ BIN := $(VENV)/bin
 DEMO_SOURCE ?= procedural:midtown?blocks=2x2&seed=1
 DEMO_DATA ?= demo_city
 PORT ?= 8000
+# A file of tests is one process's: its datasets are baked once. More than four processes would bake more of what several files share.
+PYTEST := $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
 
 .PHONY: help demo test test-all check lint-docker bench format clean
 .DEFAULT_GOAL := help
@@ -32,16 +34,16 @@ demo: $(VENV)/.ready ## bake a small procedural city and serve it, with somebody
 	$(BIN)/sectorlight serve $(DEMO_DATA) --port $(PORT) --players $(DEMO_DATA)_players.json
 
 test: $(VENV)/.ready ## the tests, without the slow ones
-	$(BIN)/python -m pytest
+	$(PYTEST)
 
 test-all: $(VENV)/.judge ## every test: slow, statistical, against Mitsuba and Radiance, and linters of docker/
-	$(BIN)/python -m pytest -m ''
+	$(PYTEST) -m ''
 
 check: $(VENV)/.ready ## the gate: format, lint, types, tests
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
-	$(BIN)/python -m pytest
+	$(PYTEST)
 
 lint-docker: $(VENV)/.docker ## lint docker/Dockerfile and docker/compose.yaml
 	$(BIN)/hadolint docker/Dockerfile

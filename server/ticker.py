@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -163,7 +164,6 @@ class Ticker:
             left_ms = FILL_UNTIL * period_s * 1e3 - (lit - begun) * 1e3
             report = self.world.tick(number, players, light, self.state.moving_boxes, left_ms)
             report.ms["light"] = (lit - begun) * 1e3
-            self._look_ahead(number + 1, begun)
         except Exception as error:
             # The world goes on: the next tick may do what this one could not.
             self.stats.failed_ticks += 1
@@ -172,6 +172,7 @@ class Ticker:
             self.failure = str(error)
             return
         self.failure = None
+        self._look_ahead(number + 1, begun)
         took_ms = (time.perf_counter() - begun) * 1e3
         self.stats.add(report, took_ms, max(begun - due, 0.0) * 1e3, period_s * 1e3)
         for listener in tuple(self.listeners):
@@ -231,7 +232,8 @@ class Ticker:
         """Make the next tick's light in one that has been short: where it changes, sectors are relit and volumes filled for it as well."""
         last = self.state.clock.last_tick
         if (time.perf_counter() - begun) * 1e3 < LONG_TICK_MS and (last is None or number <= last):
-            self._light_at(number)
+            with suppress(Exception):  # the tick that it is for says so, if it still cannot be made
+                self._light_at(number)
 
     def _make_light(self, lighting: Lighting, state: LiveState) -> LiveLight:
         settings = state.settings

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from gi_core.dataset import Dataset
+from gi_core.lighting import Lighting
 from gi_core.live_world import TickReport
 from gi_core.world import Location
 from server.live_state import LiveState
@@ -156,6 +157,21 @@ def test_a_tick_that_fails_is_counted_and_the_next_is_in_time(beat: Beat) -> Non
     assert world.numbers == [0, 1, 2, 3]
     assert world.begun_s == [0.0, PERIOD_S, 2 * PERIOD_S, 3 * PERIOD_S]
     assert (ticker.stats.failed_ticks, ticker.stats.ticks, ticker.failure) == (1, 3, None)
+
+
+def test_light_that_cannot_be_made_is_the_failure_of_the_tick_that_it_is_for(beat: Beat, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Short ticks make the next one's light."""
+    make = Ticker._lighting_at
+
+    def but_the_third(ticker: Ticker, number: int) -> Lighting:
+        if number == 2:
+            raise RuntimeError("no light")
+        return make(ticker, number)
+
+    monkeypatch.setattr(Ticker, "_lighting_at", but_the_third)
+    ticker, world = beat(4, lambda _: 0.0)
+    assert world.numbers == [0, 1, 3, 4]
+    assert (ticker.stats.failed_ticks, ticker.stats.ticks, ticker.failure) == (1, 4, None)
 
 
 def test_volumes_get_what_commands_and_light_leave_of_a_ticks_time(beat: Beat) -> None:
