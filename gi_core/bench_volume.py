@@ -58,7 +58,6 @@ def bench_step(device: Device, rounds: int = 100) -> Measurement:
     residents = {index: LiveSector(device, _sector_at(index), SKY_PATCHES, shadows, Lock()) for index in indices}
     for sector in residents.values():
         sector.resident.write_cubes(_light())
-        sector.is_lit = True
     place = np.array([4, 0, 4])
 
     def walk(step: tuple[int, int, int]) -> Callable[[], PublishedVolume]:

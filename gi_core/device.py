@@ -136,9 +136,9 @@ class Device:
         self.name = describe(self.device)
         self.is_processor = bool(self.device.type & cl.device_type.CPU)
         self.context = cl.Context([self.device])
-        properties = cl.command_queue_properties.PROFILING_ENABLE if timed else 0
-        self.lanes = tuple(cl.CommandQueue(self.context, properties=properties) for _ in range(LANES))
-        self.queue = self.lanes[0]
+        self._properties = cl.command_queue_properties.PROFILING_ENABLE if timed else 0
+        self.lanes = tuple(self._new_queue() for _ in range(LANES))
+        self._of_thread = threading.local()
         self.launched: list[tuple[str, cl.Event]] | None = [] if timed else None
         self._programs: dict[tuple[str, tuple[tuple[str, int], ...]], cl.Program] = {}
         self._shared_kernels: dict[tuple[object, ...], SharedKernel] = {}
@@ -149,6 +149,25 @@ class Device:
             if not pocl_cpu.is_unknown_cpu(str(error)) or pocl_cpu.name_compatible_cpu(self.device.int_ptr) is None:
                 raise
             self._check_layout()
+
+    @property
+    def queue(self) -> cl.CommandQueue:
+        """The queue that the calling thread uses: the device's own, the first of its lanes, unless it works ``beside`` others."""
+        return getattr(self._of_thread, "queue", self.lanes[0])
+
+    @contextmanager
+    def beside(self) -> Iterator[None]:
+        """Meanwhile the calling thread has a queue of its own, so that who waits for the device's does not wait for it. All that it has
+        enqueued is done at the end."""
+        own = self._of_thread.queue = self._new_queue()
+        try:
+            yield
+        finally:
+            del self._of_thread.queue
+            own.finish()
+
+    def _new_queue(self) -> cl.CommandQueue:
+        return cl.CommandQueue(self.context, properties=self._properties)
 
     def kernel(self, name: str, **defines: int) -> cl.Kernel:
         """A new instance of kernel ``name`` of ``name.cl``, with arguments of its own; programs are built once for each set of defines.

@@ -4,30 +4,34 @@ import numpy as np
 
 from gi_core.arrays import Float64, Int64
 from gi_core.light_blend import LightVector, relative_changes
-from gi_core.tick_plan import NEVER_RELIT
 
-# Light that was never made is as far off as can be.
+# Light that may be anything is as far off as can be.
 WHOLLY = 1.0
+# A LightVector says how much light may change at most. Of that, probes are taken to move by what they were last seen to, and this at least.
+LEAST_SHARE = 0.25
 
 
 class LightNeeds:
     """The ticker's alone. Rows are a stream_need.SectorTable's."""
 
     def __init__(self, sectors: int) -> None:
-        self.relit_at: Int64 = np.full(sectors, NEVER_RELIT, np.int64)
+        self.relit_at: Int64 = np.zeros(sectors, np.int64)
         """(n,) the tick of each sector's last relight."""
         self.exact = np.zeros(sectors, bool)
         """(n,) whether a sector holds the very bytes of a query, for light that stands still."""
-        self._change: Float64 = np.full(sectors, WHOLLY)
+        self._change: Float64 = np.zeros(sectors)
         self._numbers: Float64 | None = None
         self._scale: Float64 = np.zeros(sectors)
         self._light: LightVector | None = None
         self._moved: Float64 = np.zeros(sectors)
         """(n,) what ``_light`` has changed since each sector's last relight."""
+        self._share: Float64 = np.ones(sectors)
+        """(n,) how much of that its probes move by, LEAST_SHARE at least."""
 
-    def forget(self, row: int) -> None:
-        """A sector has just arrived: nothing is known of its light."""
-        self.relit_at[row], self.exact[row], self._change[row], self._moved[row] = NEVER_RELIT, False, WHOLLY, 0.0
+    def arrived(self, row: int, tick: int, light: LightVector, change: float) -> None:
+        """A sector has come, which was lit under a light before ``tick``; its probes last moved by a share of their peak."""
+        self._moved[row], self._share[row] = 0.0, 1.0
+        self.relit(row, tick - 1, light, change)
 
     def disturb(self, row: int, change: float) -> None:
         """Something has changed a sector's light by a share of it: a lamp, a look at the shadow map."""
@@ -38,6 +42,9 @@ class LightNeeds:
         """A sector was relit under a light, and its probes moved by a share of their peak: so far from settled are its bounces."""
         if self._numbers is None:
             self._numbers = np.zeros((len(self._change), len(light.numbers)))
+        moved = float(self._moved[row])
+        if moved > self._change[row] and not exact:  # else bounces, or what disturbed it, may be what moved its probes
+            self._share[row] = min(max(change / moved, LEAST_SHARE), 1.0)
         self._numbers[row], self._scale[row] = light.numbers, light.scale
         self.relit_at[row], self._change[row], self.exact[row] = tick, change, exact
         self._moved[row] = 0.0
@@ -52,7 +59,6 @@ class LightNeeds:
         if light is not self._light:
             self._light = light
             if self._numbers is not None:
-                lit = self.relit_at != NEVER_RELIT
-                self._moved = np.where(lit, relative_changes(self._numbers, self._scale, light), 0.0)
+                self._moved = relative_changes(self._numbers, self._scale, light)
                 self.exact[self._moved > 0] = False
-        return np.maximum(self._change[rows], self._moved[rows])
+        return np.maximum(self._change[rows], self._moved[rows] * self._share[rows])

@@ -10,6 +10,7 @@ import numpy as np
 import pyopencl as cl
 
 from gi_core.arrays import Float32, Float64
+from gi_core.background import give_way
 from gi_core.basis import basis_of_size, brightness, from_axes
 from gi_core.device import Device
 from gi_core.light_blend import LightVector
@@ -25,13 +26,14 @@ from gi_core.shadow_map import ShadowMap, SunSamples
 from gi_core.shadow_plan import FRESH_DEGREES, ShadowPlan, is_near
 from gi_core.sky_patches import face_exitance
 from gi_core.spectrum import LUMINANCE_FROM_RGB
+from gi_core.tick_plan import SETTLED_CHANGE
 from gi_core.world import Lamp
 
-# After a change this large, as a share, a relight makes several passes, so that bounces follow at once.
+# After a change this large, as a share, a relight makes several passes where somebody looks, so that bounces follow at once.
 BURST_CHANGE = 0.05
 BURST_PASSES = 3
-# Before a sector is shown for the first time: what later bounces add is then a twentieth, which comes while it fades in.
-FIRST_PASSES = 4
+# Before a sector is resident: passes at a stretch, and how often at most. After eight, bounces are within half a percent of the end.
+AHEAD_PASSES, AHEAD_TIMES = 2, 4
 # A second at 30 Hz, so that nothing pops when a sector arrives late, or when its sun's visibility has another source: in half of that, a
 # voxel that ends ten times as bright moves by a third in its first ticks.
 FADE_TICKS = 30
@@ -95,8 +97,9 @@ class LiveSector:
         """The plan of the shadow map that its samples are from; None before any."""
         self.has_other_source = False
         """Whether the next relight finds the sun's visibility from another source than the last did."""
-        self.is_lit = False
-        """Whether it was ever relit; before, it must not be shown."""
+        self.lit_ahead: LiveLight | None = None
+        """What ``light_ahead`` lit it by, and how far its light moved in the end."""
+        self.moved_ahead = 0.0
         self.shown_at = -1
         """The last tick in which what is shown of it changed."""
         self._device = device
@@ -183,10 +186,23 @@ class LiveSector:
         beyond = local - np.clip(local, self._low, self._high)
         return bool(beyond @ beyond < range_m * range_m)
 
-    def light(self, light: LiveLight) -> None:
-        """Have the relight that follows read the lamps of this light, if they can be had at once. ``measure`` must follow it."""
+    def light(self, light: LiveLight, is_read: bool) -> None:
+        """Have the relight that follows read the lamps of this light, if they can be had at once. ``measure`` must follow it. ``is_read``:
+        by a published volume."""
         self._lamps_late = not self.set_lamps(light, wait=False)
-        self._take_samples(light)
+        self._take_samples(light, is_read)
+
+    def light_ahead(self, relighter: Relighter, light: LiveLight) -> None:
+        """From darkness until it has settled or nearly so, in a loader's thread, before it is anybody's."""
+        self.set_lamps(light, wait=True)
+        for _ in range(AHEAD_TIMES):
+            give_way()
+            self.light(light, is_read=False)
+            relighter.relight([self.resident], light.given, AHEAD_PASSES)
+            self.moved_ahead = self.measure()
+            if self.moved_ahead <= SETTLED_CHANGE:
+                break
+        self.lit_ahead = light
 
     def measure(self) -> float:
         """Read what a relight gave: how far it moved the probes' light, as a share of the brightest."""
@@ -196,21 +212,20 @@ class LiveSector:
         if self._starts_fade:
             self._starts_fade = False
             self._faded = self._blended_faded = FADE_TICKS - fade_ticks(self._cubes, after)
-        self._cubes, self.is_lit = after, True
+        self._cubes = after
         share = moved / peak if peak > 0 else float(moved > 0)
         self._unshown += share
         return 1.0 if self._lamps_late else share
 
-    def settle(self, relighter: Relighter, light: LiveLight) -> bool:
+    def settle(self, relighter: Relighter, light: LiveLight, is_read: bool) -> bool:
         """Converge from darkness, as a query does: what is held then depends on the light alone, and on nothing that was before.
 
         False, and nothing done, while another thread traces the shadows of lamps that this needs.
         """
         if not self.set_lamps(light, wait=False):
             return False
-        self._take_samples(light)
+        self._take_samples(light, is_read)
         self._cubes = relighter.converge(self.resident, light.given).cubes
-        self.is_lit = True
         return True
 
     def advance(self, tick: int, must_show: bool, is_read: bool) -> None:
@@ -219,7 +234,7 @@ class LiveSector:
 
         A sector fades where something else was shown before: while no published volume reads it (``is_read``), it changes unseen.
         """
-        if self.is_lit and self.is_fading:
+        if self.is_fading:
             if is_read:
                 self._faded += 1
             else:
@@ -274,15 +289,15 @@ class LiveSector:
         if sector.probe_count:
             cl.enqueue_copy(self._device.queue, self._shown, np.tile(row.astype(np.float32), (sector.probe_count, 1)))
 
-    def _take_samples(self, light: LiveLight) -> None:
+    def _take_samples(self, light: LiveLight, is_read: bool) -> None:
         """Before a relight: forget samples that are too old for it, and where the sun's visibility has another source than it had, have
-        what is shown go over from what it was."""
+        what is shown go over from what it was, if it is read."""
         self._expire_samples(light)
         if not self.has_other_source:
             return
         self.has_other_source = False
-        if self._shown is None and self.is_fading:
-            return  # nothing of it was shown
+        if not is_read or (self._shown is None and self.is_fading):
+            return  # nobody sees it change, or nothing of it was shown
         if self._shown is None:
             self._shown = self._device.allocate(self.resident.cubes.size)
             cl.enqueue_copy(self._device.queue, self._shown, self.resident.cubes)

@@ -1,6 +1,7 @@
 """The shadow map of the live world: drawn around players in turn, a little each tick, and sampled by the sectors it covers."""
 
 import logging
+import math
 from collections import OrderedDict
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import Future
@@ -38,8 +39,11 @@ SECTORS_SAMPLED_PER_TICK = 2
 PLAYERS_PER_SHARE, MOST_SHARES = 10, 6
 # Where many walk, the next tick looks at others.
 PLAYERS_LOOKED_AT_PER_TICK = 4
-# Sectors with ground this near to a player, along x and z, lie whole in a map around it, whose middle is rounded to texels.
+# Sectors with ground this near to a map's middle, along x and z, lie whole in it; the middle is rounded to texels.
 NEAR_M = HALF_MAP_M - SECTOR_SIZE_M - 1.0
+# Maps are drawn around where players will be in so long [s], but not farther ahead than this [m]: the map then still covers what their
+# volumes read behind them.
+LEAD_S, MOST_LEAD_M = 1.0, 24.0
 # Triangles of sectors towards the sun that are kept in memory, 48 bytes each.
 KEPT_BYTES = 1 << 26
 
@@ -80,11 +84,13 @@ class LiveShadows:
     def step(
         self,
         positions: Float64,
+        velocities: Float64,
         light: LiveLight,
         boxes: Sequence[MovingBox],
         residents: Mapping[SectorIndex, LiveSector],
     ) -> tuple[SectorIndex, ...]:
-        """One tick's share of planning, drawing and sampling, for players at positions (p, 3) [m]; sectors whose sun that changes."""
+        """One tick's share of planning, drawing and sampling, for players at positions (p, 3) [m] with velocities (p, 3) [m/s]; sectors
+        whose sun that changes."""
         if not light.sun_is_up:
             if self._dark:
                 return ()
@@ -118,11 +124,11 @@ class LiveShadows:
         elif len(positions):
             if boxes is not self._boxes[0]:
                 self._boxes = boxes, box_corners(boxes)
-            self._plan(positions, light.to_sun, self._boxes[1], residents)
+            self._plan(positions + np.clip(LEAD_S * velocities, -MOST_LEAD_M, MOST_LEAD_M), light.to_sun, self._boxes[1], residents)
         return ()
 
     def _plan(self, positions: Float64, to_sun: Float64, boxes: Float64, residents: Mapping[SectorIndex, LiveSector]) -> None:
-        """Plan a map for the next player, in turn, that is near a sector which lacks samples."""
+        """Plan a map around the next of some positions (p, 3) [m], in turn, that is near a sector which lacks samples."""
         count = len(positions)
         for offset in range(min(count, PLAYERS_LOOKED_AT_PER_TICK)):
             player = (self._turn + offset) % count
@@ -186,7 +192,9 @@ def covered(plan: ShadowPlan, sectors: Collection[SectorIndex]) -> list[SectorIn
 
 def sectors_within(distance_m: float, position: Float64, sectors: Collection[SectorIndex]) -> list[SectorIndex]:
     """Those of ``sectors`` with ground less than a distance away from a position (3,) [m] along x and z both."""
-    x0, z0 = np.floor((position[[0, 2]] - distance_m) / SECTOR_SIZE_M).astype(int).tolist()
-    x1, z1 = np.floor((position[[0, 2]] + distance_m) / SECTOR_SIZE_M).astype(int).tolist()
-    around = (SectorIndex(x, z) for x in range(x0, x1 + 1) for z in range(z0, z1 + 1))
+    x, _, z = position.tolist()
+    columns, lines = (
+        range(math.floor((at - distance_m) / SECTOR_SIZE_M), math.floor((at + distance_m) / SECTOR_SIZE_M) + 1) for at in (x, z)
+    )
+    around = (SectorIndex(column, line) for column in columns for line in lines)
     return [index for index in around if index in sectors]

@@ -46,7 +46,7 @@ class PublishedVolume:
 class _Layout:
     """What does not change while the volume stays and the same sectors are there.
 
-    first : (3,) where it stands; present : sectors that are there, and lit
+    first : (3,) where it stands; present : sectors that are there
     boxes : parts that they fill, each with the parts of it that the layout before did not have; mask : all classes
     placeholders : sectors of the world that are not there, with the columns (z, x) that stand for each
     outside : columns (z, x) without a sector, and for each the column that it copies
@@ -91,7 +91,7 @@ class LiveVolume:
 
     def enqueue(self, residents: Mapping[SectorIndex, LiveSector], shown: ShownCubes) -> None:
         """Enqueue the filling of what has changed; ``publish`` must follow."""
-        present = frozenset(i for i in self.touched if i in residents and residents[i].is_lit)
+        present = frozenset(index for index in self.touched if index in residents)
         before = self._layout
         is_new = before is None or present != before.present or self._first is not before.first
         if is_new:
@@ -187,7 +187,7 @@ def _lay_out(
         slices = box_slices(box)
         if box.index in present:
             sector = residents[box.index].resident.sector
-            # One that has just arrived, or was just lit, is new as a whole.
+            # One that has just arrived is new as a whole.
             new_parts = [box] if before is None or box.index not in before.present else came_into_sight(box, first, before.first)
             for part in new_parts:
                 mask[box_slices(part)] = box_mask(part, sector)

@@ -20,7 +20,7 @@ from gi_core.grid import SectorIndex, volume_first_voxel
 from gi_core.live_sector import LiveSector
 from gi_core.live_volume import LiveVolume, ShownCubes, volume_arrays
 
-# A new player's first volume is held back until all of its sectors are lit, but not for longer than two seconds at 30 Hz.
+# A new player's first volume is held back until all of its sectors are there, but not for longer than two seconds at 30 Hz.
 HELD_TICKS = 60
 
 
@@ -53,8 +53,8 @@ class LiveVolumes:
 
     @property
     def missing(self) -> tuple[SectorIndex, ...]:
-        """Sectors that published volumes read and that are not there, or not lit yet."""
-        return tuple(index for index in self.looked_at if not self._is_lit(index))
+        """Sectors that published volumes read and that are not there."""
+        return tuple(index for index in self.looked_at if index not in self._residents)
 
     def note(self, tick: int, ids: Sequence[str], positions: Float64, changed: Sequence[SectorIndex]) -> None:
         """Find what has to be filled: for players ``ids`` (p) at positions (p, 3) [m], and sectors that show something else now."""
@@ -120,13 +120,12 @@ class LiveVolumes:
                 if not self.looked_at[index]:
                     del self.looked_at[index]
 
-    def _is_lit(self, index: SectorIndex) -> bool:
-        return index in self._residents and self._residents[index].is_lit
-
     def _is_held(self, name: str, tick: int) -> bool:
         """Whether a new player's first volume waits for sectors that are on their way."""
         volume = self.of_player[name]
-        return volume.published is None and tick < self._behind[name].since + HELD_TICKS and not all(map(self._is_lit, volume.touched))
+        if volume.published is not None or tick >= self._behind[name].since + HELD_TICKS:
+            return False
+        return not all(index in self._residents for index in volume.touched)
 
 
 def _away_m(index: SectorIndex, x: float, z: float) -> float:

@@ -2,8 +2,8 @@
 
 A tick, in order:
 
-    relight      take over sectors that loaders have finished, and relight those that tick_plan chooses; in an idle world one that has not
-                 settled exactly
+    relight      take over sectors that loaders have put on the device and lit, and relight those that tick_plan chooses; in an idle world
+                 one that has not settled exactly
     volumes      of players who moved, or near whom something was relit, until the tick's time for it is spent; the rest wait
     shadow map   draw some more of the next one; sectors take samples of one that was just drawn
     stream       plan loads and evictions for where players are and go; after a long tick the next does, for a while
@@ -34,7 +34,7 @@ from gi_core.layout import DIRECTIONAL_LIGHT, MAX_DIRECTIONAL_LIGHTS
 from gi_core.light_geometry import ShadowGeometry
 from gi_core.light_needs import WHOLLY, LightNeeds
 from gi_core.light_surfels import SurfelLights
-from gi_core.live_sector import BURST_CHANGE, BURST_PASSES, FIRST_PASSES, LiveLight, LiveSector
+from gi_core.live_sector import BURST_CHANGE, BURST_PASSES, LiveLight, LiveSector
 from gi_core.live_shadows import LiveShadows
 from gi_core.live_volume import PublishedVolume
 from gi_core.live_volumes import LiveVolumes
@@ -67,7 +67,7 @@ class TickPlayers:
 class TickReport:
     """What a tick did. Times in milliseconds.
 
-    relit, settled : sectors that were lit; missing : those that published volumes read and that are not there, or not lit yet
+    relit, settled : sectors that were lit; missing : those that published volumes read and that are not there
     filled : players whose volume was filled; waiting : how many volumes wait for another tick
     """
 
@@ -107,6 +107,8 @@ class LiveWorld:
         self.plan: StreamPlan | None = None
         self._device = Device(device)
         self._relighter = Relighter(self._device)
+        self._relighter_ahead = Relighter(self._device)
+        """The loader's, for sectors that are not resident yet."""
         self._places = places
         conversion(dataset.world.basis, basis)
         self.basis = basis
@@ -160,7 +162,7 @@ class LiveWorld:
 
         report.loaded = tuple(self.streamer.take_over())
         for index in report.loaded:
-            self._needs.forget(self._row[index])
+            self._welcome(index, tick, light)
         gains_changed = self._light is not None and self._light.settings != light.settings
         if light is not self._light:
             self._placeholders.clear()
@@ -174,7 +176,7 @@ class LiveWorld:
         report.filled, report.waiting = self.volumes.fill(tick, until_s, lambda sector: self._shown(sector, light), self._placeholder)
         lap("volumes")
         if self._shadows is not None:
-            sampled = self._shadows.step(players.positions, light, boxes, self.streamer.residents)
+            sampled = self._shadows.step(players.positions, players.velocities, light, boxes, self.streamer.residents)
             for index in sampled:
                 other = index in self.streamer.residents and self.streamer.residents[index].has_other_source
                 self._needs.disturb(self._row[index], WHOLLY if other else BURST_CHANGE)
@@ -202,7 +204,7 @@ class LiveWorld:
             return
         index = min(lit, key=lambda i: (world.sectors[i].surfels, i))
         read = self.dataset.sector(index)
-        sector = self._place(read)
+        sector = self._new_sector(read)
         lamps = _lit_by_a_lamp(self._device, read, world.sectors)
         samples = self._device.allocate(sector.resident.sector.surfel_count + 8)
         for lights, snow, shining, sun_map in product(range(MAX_DIRECTIONAL_LIGHTS + 1), (0.0, 0.5), (None, lamps.buffer), (None, samples)):
@@ -237,13 +239,26 @@ class LiveWorld:
                 self.streamer.count_again(index, lamps=True)
 
     def _place(self, sector: Sector) -> LiveSector:
-        """In a loader's thread: on the device, with the shadows of the lamps that shine now."""
-        placed = LiveSector(self._device, sector, self.dataset.world.sky_patches, self._geometry, self._tracing)
-        if self._light is not None:
-            placed.set_lamps(self._light, wait=True)
-            if self._shadows is not None and self._light.sun_is_up:
+        """In a loader's thread: on the device, and lit, so that no tick has to."""
+        light = self._light
+        assert light is not None  # ticks ask for sectors, and have light
+        with self._device.beside():
+            placed = self._new_sector(sector)
+            placed.light_ahead(self._relighter_ahead, light)
+            if self._shadows is not None and light.sun_is_up:
                 placed.make_room_for_samples()
         return placed
+
+    def _new_sector(self, sector: Sector) -> LiveSector:
+        return LiveSector(self._device, sector, self.dataset.world.sky_patches, self._geometry, self._tracing)
+
+    def _welcome(self, index: SectorIndex, tick: int, light: LiveLight) -> None:
+        """Note how far a sector that has just arrived is from the light it should have."""
+        row, sector = self._row[index], self.streamer.residents[index]
+        assert sector.lit_ahead is not None
+        self._needs.arrived(row, tick, sector.lit_ahead.vector, sector.moved_ahead)
+        if sector.lamps.given != (light.static_lamps, light.dynamic_lamps):
+            self._needs.disturb(row, WHOLLY)
 
     def _relight(self, tick: int, light: LiveLight, report: TickReport) -> None:
         residents, needs, plan = self.streamer.residents, self._needs, self.plan
@@ -252,26 +267,26 @@ class LiveWorld:
         rows = self.streamer.resident_rows()
         changes = needs.changes(rows, light.vector)
         away = plan.needs.away_m[rows]
-        chosen = [int(rows[k]) for k in plan_tick(tick, needs.relit_at[rows], changes, away, places=self._places)]
-        change_of = dict(zip(rows.tolist(), changes.tolist(), strict=True))
-        sectors = [residents[self.streamer.table.sectors[row]] for row in chosen]
-        passes = []
-        for row, sector in zip(chosen, sectors, strict=True):
-            sector.light(light)
-            passes.append(1 if change_of[row] <= BURST_CHANGE else BURST_PASSES if sector.is_lit else FIRST_PASSES)
+        chosen = plan_tick(tick, needs.relit_at[rows], changes, away, places=self._places)
+        indices = tuple(self.streamer.table.sectors[rows[k]] for k in chosen)
+        sectors = [residents[index] for index in indices]
+        read = [index in self.volumes.looked_at for index in indices]
+        for sector, is_read in zip(sectors, read, strict=True):
+            sector.light(light, is_read)
+        passes = [BURST_PASSES if is_read and changes[k] > BURST_CHANGE else 1 for k, is_read in zip(chosen, read, strict=True)]
         if sectors:
             self._relighter.relight([sector.resident for sector in sectors], light.given, passes)
         report.passes = sum(passes)
-        for row, sector in zip(chosen, sectors, strict=True):
-            needs.relit(row, tick, light.vector, sector.measure())
-        report.relit = tuple(self.streamer.table.sectors[row] for row in chosen)
+        for k, sector in zip(chosen, sectors, strict=True):
+            needs.relit(int(rows[k]), tick, light.vector, sector.measure())
+        report.relit = indices
         if not chosen and light.standing:
             # An idle world has time to make what it shows the very bytes of a query: nearest first, one a tick.
             inexact = np.flatnonzero(~needs.exact[rows])
             if len(inexact):
                 row = int(rows[inexact[np.argmin(away[inexact])]])
                 index = self.streamer.table.sectors[row]
-                if residents[index].settle(self._relighter, light):
+                if residents[index].settle(self._relighter, light, index in self.volumes.looked_at):
                     needs.relit(row, tick, light.vector, 0.0, exact=True)
                     report.settled = (index,)
         for index in (*report.relit, *report.settled):

@@ -57,7 +57,7 @@ class Relighter:
             self._light = LightOnDevice(self.device, given)
         for resident in residents:
             resident.light(self._light)
-        lanes = self.device.lanes[: len(residents)]
+        lanes = (self.device.queue, *self.device.lanes[1:])[: len(residents)]
         if len(lanes) > 1:
             # By the host: what queues wait for one another costs more than going on side by side gains.
             self.device.queue.finish()

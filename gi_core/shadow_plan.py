@@ -137,7 +137,7 @@ def sun_or_box_moved(last: ShadowPlan, to_sun: Float64, boxes: Float64) -> bool:
     place is not asked for."""
     if not is_near(last.to_sun, to_sun, SUN_MOVED_DEGREES) or len(boxes) != len(last.boxes):
         return True
-    return bool((np.linalg.norm(boxes - last.boxes, axis=2) > BOX_MOVED_M).any())
+    return len(boxes) > 0 and bool((np.linalg.norm(boxes - last.boxes, axis=2) > BOX_MOVED_M).any())
 
 
 def is_near(a: Float64, b: Float64, degrees: float = FRESH_DEGREES) -> bool:

@@ -27,8 +27,8 @@ _HOST_BYTES_PER = {"probes": 24, "bricks": 20, "surfels": 36, "voxels": 3}
 _HOST_BYTES_PER_COEFFICIENT, _HOST_BYTES_PER_FEEDBACK = 16, 6
 _BYTES_PER_SECTOR = 1 << 15
 
-# A plan holds while no player has gone this far [m] or changed speed by this much [m/s], a small part of what its margins allow for, but
-# not longer than this [s]: then sectors that failed may be tried again.
+# A plan holds while no player is this far [m] from where it was going or has changed speed by this much [m/s], a small part of what its
+# margins allow for, but not longer than this [s]: then sectors that failed may be tried again.
 PLAN_HOLDS_M, PLAN_HOLDS_M_S, PLAN_HOLDS_S = 1.0, 0.5, 0.25
 
 
@@ -162,11 +162,12 @@ class Streamer:
 
     def _holds(self, positions: Float64, velocities: Float64) -> bool:
         before, going, at_s = self._planned
+        passed_s = time.monotonic() - at_s
         return (
-            time.monotonic() - at_s < PLAN_HOLDS_S
+            passed_s < PLAN_HOLDS_S
             and before.shape == positions.shape
-            and bool((np.abs(positions - before) <= PLAN_HOLDS_M).all())
             and bool((np.abs(velocities - going) <= PLAN_HOLDS_M_S).all())
+            and bool((np.abs(positions - before - passed_s * going) <= PLAN_HOLDS_M).all())
         )
 
     def count_again(self, index: SectorIndex, lamps: bool) -> None:

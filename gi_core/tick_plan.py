@@ -4,7 +4,7 @@ One place goes to the sectors that players stand in, in turn; the others to whic
 
     need = ticks since it was relit  x  how much its light has changed  x  how near a player is
 
-with sectors that were never lit before all others, nearest first. A settled sector needs nothing, so an idle world relights nothing.
+A settled sector needs nothing, so an idle world relights nothing; what nobody is near to counts as settled sooner.
 
 Nobody starves. Change and nearness are weights within 1 .. 1 / WEIGHT_RATIO, whatever their values, while the wait grows without bound.
 With g general places a tick, a sector that has waited a ticks loses only to sectors that have waited a / WEIGHT_RATIO or more, so in that
@@ -17,9 +17,9 @@ import numpy as np
 
 from gi_core.arrays import Float64, Int64
 
-# A relative change of light below this is not worth a relight: a ninth of the finest step that an 8-bit sRGB picture shows (0.9 %).
+# A relative change of light below this is not worth a relight: a ninth of the finest step that an 8-bit sRGB picture shows (0.9 %). Where
+# no volume reads it, one below this over the weight of nearness is not.
 SETTLED_CHANGE = 1e-3
-NEVER_RELIT = -1
 # Least weights: of a change that is barely worth a relight, and of a sector that no volume reads.
 _LEAST_CHANGE_WEIGHT, _LEAST_NEARNESS_WEIGHT = 0.25, 0.25
 WEIGHT_RATIO = 1 / (_LEAST_CHANGE_WEIGHT * _LEAST_NEARNESS_WEIGHT)
@@ -33,7 +33,7 @@ def plan_tick(tick: int, relit_at: Int64, change: Float64, away_m: Float64, *, p
 
     Parameters
     ----------
-    relit_at : (n,) int64, the tick of each resident sector's last relight, before ``tick``; NEVER_RELIT for a newly loaded one
+    relit_at : (n,) int64, the tick of each resident sector's last relight, before ``tick``
     change : (n,) float64, relative: how much its light has changed since then, or how far its bounces are from having settled
     away_m : (n,) float64 [m], from each sector to the nearest player, 0 where one stands in it; as in stream_need.Needs
 
@@ -43,8 +43,8 @@ def plan_tick(tick: int, relit_at: Int64, change: Float64, away_m: Float64, *, p
         raise ValueError(f"expected two places or more, got {places}")
     need = relight_need(tick, relit_at, change, away_m)
     chosen: list[int] = []
-    for candidates in (np.where(away_m == 0, need, 0.0), *(need for _ in range(places))):
-        if len(chosen) == places or len(need) == 0:
+    for candidates in (np.where(away_m == 0, need, 0.0), *(need for _ in range(places))) if need.any() else ():
+        if len(chosen) == places:
             break
         best = int(candidates.argmax())
         if candidates[best] > 0:
@@ -55,12 +55,14 @@ def plan_tick(tick: int, relit_at: Int64, change: Float64, away_m: Float64, *, p
 
 def relight_need(tick: int, relit_at: Int64, change: Float64, away_m: Float64) -> Float64:
     """How much each sector needs to be relit, (n,); 0 for settled ones. Arguments as for ``plan_tick``."""
+    need = np.zeros(len(change))
     nearness = np.maximum(_NEAR_M / np.maximum(away_m, _NEAR_M), _LEAST_NEARNESS_WEIGHT)
-    # The square root, because from a change of a thousandth to one of one is a long way.
-    weight = np.clip(np.sqrt(np.maximum(change, 0.0)), _LEAST_CHANGE_WEIGHT, 1.0) * nearness
-    need = np.where(change > SETTLED_CHANGE, (tick - relit_at) * weight, 0.0)
-    # More than any wait can be, nearest first; without players there is no nearest, and still they are lit.
-    return np.where(relit_at == NEVER_RELIT, np.maximum(1e18 / (1.0 + away_m), 1e15), need)
+    off = np.flatnonzero(change * nearness > SETTLED_CHANGE)
+    if len(off):  # in most ticks nobody is
+        # The square root, because from a change of a thousandth to one of one is a long way.
+        weight = np.clip(np.sqrt(change[off]), _LEAST_CHANGE_WEIGHT, 1.0) * nearness[off]
+        need[off] = (tick - relit_at[off]) * weight
+    return need
 
 
 def longest_wait(sectors: int, *, places: int = PLACES) -> int:

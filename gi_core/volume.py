@@ -115,16 +115,21 @@ def lattice_record(box: SectorBox, first: Int32, shape: tuple[int, ...]) -> AnyA
 
 def sector_slices(box: SectorBox, sector: Sector) -> tuple[AnyArray, slice, slice]:
     """Indices (y, z, x) into a sector's voxel arrays that a box reads; heights beyond its layers read the lowest or highest."""
-    first = box.lattice_first - sector.voxel_first
-    y = np.clip(first[1] + np.arange(box.size[1]), 0, sector.voxel_class.shape[0] - 1)
-    return y, slice(int(first[2]), int(first[2] + box.size[2])), slice(int(first[0]), int(first[0] + box.size[0]))
+    y = np.clip(int(box.lattice_first[1] - sector.voxel_first[1]) + np.arange(box.size[1]), 0, sector.voxel_class.shape[0] - 1)
+    return y, *_columns(box, sector)
+
+
+def _columns(box: SectorBox, sector: Sector) -> tuple[slice, slice]:
+    """The columns (z, x) of a sector's voxel arrays that a box reads."""
+    (x, _, z), (nx, _, nz) = (box.lattice_first - sector.voxel_first).tolist(), box.size.tolist()
+    return slice(z, z + nz), slice(x, x + nx)
 
 
 def box_mask(box: SectorBox, sector: Sector) -> UInt8:
     """Voxel classes (y, z, x) of a box. Below what a sector stores is solid."""
     mask: UInt8 = np.empty(box.size[[1, 2, 0]], np.uint8)
     first, layers, height = int(box.lattice_first[1] - sector.voxel_first[1]), len(sector.voxel_class), int(box.size[1])
-    _, z, x = sector_slices(box, sector)
+    z, x = _columns(box, sector)
     # Layers that are stored, what lies below them, and above them the highest again.
     low, high = min(max(-first, 0), height), min(max(layers - first, 0), height)
     mask[:low] = VOXEL_SOLID

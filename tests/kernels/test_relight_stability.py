@@ -105,7 +105,7 @@ def test_with_all_gains_and_colours_at_their_maximum_ticks_never_grow(make_secto
     live = LiveSector(device, sector, PATCHES, ShadowGeometry({}.__getitem__, []), Lock())
     shown, kept = np.zeros((2, sector.probe_count, 6, 4), np.float32)
     for tick in range(ticks):
-        live.light(light)
+        live.light(light, is_read=True)
         relighter.relight([live.resident], light.given)
         live.measure()
         live.advance(tick, must_show=True, is_read=True)
