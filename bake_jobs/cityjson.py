@@ -16,7 +16,7 @@ import numpy as np
 from bake_jobs.geography import MapFrame, centre_of, lonlat_from_epsg, timezone_at
 from bake_jobs.rays import RayScene
 from bake_jobs.scene import Mesh, SourceContent, join_meshes
-from bake_jobs.solids import triangulate
+from bake_jobs.solids import expect_few_rings, triangulate
 from bake_jobs.terrain import CELL_M, MAX_CELLS, Terrain, cells_needed, terrain_under
 from gi_core.arrays import Bool, Float64, Int64
 from gi_core.errors import SourceError
@@ -145,11 +145,14 @@ def _polygons(document: dict[str, Any], vertex_count: int, path: Path) -> Iterat
             depth = _POLYGON_DEPTH[geometry["type"]]
             leaves = _leaves(geometry["boundaries"], semantics.get("values"), depth)
             for rings, value in leaves:
+                expect_few_rings(rings, f"{path}: object {name!r}")
                 surface = surfaces[value] if isinstance(value, int) and 0 <= value < len(surfaces) else ""
                 indices = [np.array(ring, np.int64) for ring in rings if len(ring) >= 3]
                 if not indices or any(ring.min() < 0 or ring.max() >= vertex_count for ring in indices):
                     continue  # no polygon, or one over vertices that the file does not have
                 yield _Polygon(indices, surface if surface in SURFACE_ALBEDO else kind, kind in BUILDINGS, number)
+        except SourceError:
+            raise
         except (TypeError, ValueError, KeyError, AttributeError, IndexError) as error:
             raise SourceError(f"{path}: object {name!r}: expected CityJSON geometry ({error})") from error
 

@@ -17,7 +17,7 @@ import shapely
 
 from bake_jobs.geography import MapFrame, centre_of, timezone_at
 from bake_jobs.scene import Mesh, SourceContent, join_meshes
-from bake_jobs.solids import prism
+from bake_jobs.solids import expect_few_rings, prism
 from bake_jobs.terrain import MAX_CELLS, Terrain, cells_needed, terrain_under
 from gi_core.arrays import Float32, Float64
 from gi_core.errors import SourceError
@@ -106,6 +106,7 @@ def _read_parts(path: Path) -> list[_Part]:
             continue
         building = str(properties.get("building", number))
         for rings in _polygons(feature.get("geometry"), where):
+            expect_few_rings(rings, where)
             points += sum(len(ring) for ring in rings)
             if points > MAX_POINTS:
                 raise SourceError(f"{path}: expected at most {MAX_POINTS:,} points, found more; split the file")

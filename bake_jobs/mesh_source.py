@@ -51,7 +51,7 @@ def load_mesh(path: Path) -> SourceContent:
     except SourceError:
         raise
     except Exception as error:  # the reader raises whatever a malformed file leads it to
-        detail = " ".join(str(error).split())[:200] or type(error).__name__
+        detail = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"  # a KeyError's own text is a name and nothing else
         raise SourceError(
             f"{path}: expected a readable {suffix[1:].upper()} mesh, found a broken one ({detail}); export it again"
         ) from error

@@ -1,11 +1,16 @@
 """Closed solids of flat pieces: boxes, and prisms over polygons with holes. Triangles run counter-clockwise seen from outside."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import mapbox_earcut
 import numpy as np
 
 from gi_core.arrays import AnyArray, Float64, Int64, UInt32
+from gi_core.errors import SourceError
+
+# Of one polygon: ear clipping looks for each hole's bridge among all points, so 2 000 holes take 2 s and 10 000 a minute and a half.
+MAX_RINGS = 2000
 
 # Corner i of a box is the maximum along axis a where bit a of i is set.
 _BOX_QUADS = ((0, 4, 6, 2), (1, 3, 7, 5), (0, 1, 5, 4), (2, 6, 7, 3), (0, 2, 3, 1), (4, 5, 7, 6))
@@ -19,6 +24,12 @@ def boxes(minimum: Float64, maximum: Float64) -> tuple[Float64, Int64]:
     vertices = np.where(bits[None], maximum[:, None], minimum[:, None])
     triangles = BOX_TRIANGLES[None] + 8 * np.arange(len(minimum))[:, None, None]
     return vertices.reshape(-1, 3), triangles.reshape(-1, 3)
+
+
+def expect_few_rings(rings: Sequence[Any], where: str) -> None:
+    """Raise SourceError for a polygon that would take too long to triangulate."""
+    if len(rings) > MAX_RINGS:
+        raise SourceError(f"{where}: expected a polygon of at most {MAX_RINGS} rings, found {len(rings)}; cut it into several")
 
 
 def triangulate(points: Float64, ring_ends: UInt32) -> Int64:

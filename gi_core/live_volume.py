@@ -207,7 +207,8 @@ def _lay_out(
 def _copy_moved(source: UInt8, target: UInt8, step: Int64) -> None:
     """What two volumes (y, z, x) both show, where the second stands a step (x, y, z) from the first."""
     pairs = [
-        (slice(max(by, 0), count + min(by, 0)), slice(max(-by, 0), count - max(by, 0)))
+        # A slice that ended below 0 would count from the far end.
+        (slice(max(by, 0), max(count + min(by, 0), 0)), slice(max(-by, 0), max(count - max(by, 0), 0)))
         for by, count in zip(step[[1, 2, 0]].tolist(), source.shape, strict=True)
     ]
     target[tuple(to for _, to in pairs)] = source[tuple(of for of, _ in pairs)]

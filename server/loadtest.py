@@ -15,6 +15,7 @@ from urllib.parse import urlsplit
 import httpx
 
 from gi_core.errors import InputError, SectorlightError
+from server.json_input import identifier
 from server.loadtest_clients import Watch, fetch, stream
 from server.loadtest_record import Live, Recorder, Setting, report_of
 
@@ -153,12 +154,20 @@ async def _players(http: httpx.AsyncClient, options: Options) -> AsyncIterator[l
 
 def _player_name(reply: httpx.Response) -> str:
     try:
-        name = reply.json()["id"]
-    except (ValueError, KeyError, TypeError):
-        name = None
-    if not isinstance(name, str) or not name:
-        raise LoadTestError(f"POST /v1/players: expected a reply with an id, found {reply.text[:200]!r}")
-    return name
+        return identifier(_object(reply).get("id"), "id")
+    except ValueError as error:
+        raise LoadTestError(f"POST /v1/players: expected a reply with an id, found {reply.text[:200]!r}") from error
+
+
+def _object(reply: httpx.Response) -> dict[str, Any]:
+    """The JSON object that a reply is. Raises ValueError."""
+    try:
+        record = reply.json()
+    except RecursionError as error:
+        raise ValueError("expected a JSON object, found one too deep to read") from error
+    if not isinstance(record, dict):
+        raise ValueError(f"expected a JSON object, found a {type(record).__name__}")
+    return record
 
 
 async def _send(http: httpx.AsyncClient, method: str, target: str, url: str, **content: Any) -> httpx.Response:
@@ -193,9 +202,8 @@ async def _ask_live(http: httpx.AsyncClient, watch: Watch) -> None:
     known = watch.recorder.known_tick
     try:
         reply = await http.get("/v1/live", params={} if known is None else {"since": known})
-        members = reply.json() if reply.status_code == 200 else None
-        if isinstance(members, dict):
-            watch.recorder.server(Live(watch.now(), members))
+        if reply.status_code == 200:
+            watch.recorder.server(Live(watch.now(), _object(reply)))
         else:
             watch.error(f"GET /v1/live: status {reply.status_code}")
     except (httpx.HTTPError, ValueError) as error:
@@ -205,10 +213,10 @@ async def _ask_live(http: httpx.AsyncClient, watch: Watch) -> None:
 async def _ask_clock(http: httpx.AsyncClient, watch: Watch, last: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
     """The world's clock: (asked at [s], its time [s], its rate); tells the recorder when it was set since ``last``."""
     try:
-        members = (await http.get("/v1/clock")).json()
+        members = _object(await http.get("/v1/clock"))
         rate = 0.0 if members["paused"] else float(members["rate"])
         found = watch.now(), datetime.fromisoformat(members["time"]).timestamp(), rate
-    except (httpx.HTTPError, ValueError, KeyError, TypeError):
+    except (httpx.HTTPError, ValueError, KeyError, TypeError, OverflowError):
         return last  # without a clock no jump is known, and pops count
     if last is not None:
         low, high = sorted(r * (found[0] - last[0]) for r in (last[2], rate))

@@ -14,7 +14,7 @@ from websockets.exceptions import WebSocketException
 
 from gi_core.arrays import Float32, UInt8
 from gi_core.basis import brightness
-from gi_core.constants import VOXEL_INDOORS, VOXEL_OUTDOORS
+from gi_core.constants import BASIS_SIZES, VOXEL_INDOORS, VOXEL_OUTDOORS
 from server.frame_prefix import FrameKind
 from server.loadtest_record import Recorder
 from server.stream_header import FrameLostError, StreamError, parse_header
@@ -151,10 +151,12 @@ def read_reply(reply: httpx.Response) -> Fetched:
         facts, tick = json.loads(reply.headers["Gi-Volume"]), int(reply.headers["Gi-Tick"])
         shape, scale, basis = tuple(map(int, facts["shape"])), float(facts["scale"]), str(facts["basis"])
         origin = tuple(map(float, facts["origin"]))
-    except (KeyError, TypeError, ValueError, RecursionError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         raise StreamError(f"expected headers Gi-Volume and Gi-Tick, found {_reason(error)}") from error
     if len(shape) != 5 or shape[4] != 4 or min(shape) < 1 or len(reply.content) != 2 * math.prod(shape):
         raise StreamError(f"expected {shape} halves, found {len(reply.content)} bytes")
+    if shape[0] != BASIS_SIZES.get(basis) or not 0 < scale < math.inf:
+        raise StreamError(f"expected a basis of {shape[0]} coefficients and a scale above 0, found {basis[:20]!a} and {scale:g}")
     texels = np.frombuffer(reply.content, "<f2").reshape(shape[0], -1, 4)
     values = texels[..., :3].astype(np.float32) * np.float32(scale)
     return Fetched(tick, origin, basis, values, texels[0, :, 3].astype(np.uint8))

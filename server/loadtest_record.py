@@ -1,6 +1,5 @@
 """What a load test sees, second by second, and the figures it comes to."""
 
-import math
 from bisect import bisect_right
 from collections import Counter, defaultdict
 from collections.abc import Sequence
@@ -9,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+# What a server says of itself is 0 or within these; anything else is no figure, and no sum or quotient of figures is beyond float.
+LEAST_FIGURE, LARGEST_FIGURE = 1e-9, 1e15
 # Different errors that a report quotes; all are counted.
 MAX_QUOTED_ERRORS = 20
 # The server is asked once a second, so a jump is seen up to a second late, and what it does to the light takes some ticks.
@@ -36,19 +37,26 @@ class Live:
     members: dict[str, Any]
 
     def number(self, *names: str) -> float | None:
-        """A member, or a member of a member; None when it is not a finite number."""
+        """A member, or a member of a member; None when it is no figure."""
         value: Any = self.members
         for name in names:
             value = value.get(name) if isinstance(value, dict) else None
-        return float(value) if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value) else None
+        return float(value) if _is_figure(value) else None
 
     def ticks(self) -> tuple[list[int], list[float], list[float]]:
         """The ticks that it tells of one by one: their numbers, what each took [ms], how late each began [ms]. Raises ValueError."""
         try:
-            numbers, took_ms, lateness_ms = (self.members["recent"][name] for name in ("tick", "ms", "lateness_ms"))
-            return [int(n) for n in numbers], [float(ms) for ms in took_ms], [float(ms) for ms in lateness_ms]
+            numbers, took_ms, lateness_ms = (list(self.members["recent"][name]) for name in ("tick", "ms", "lateness_ms"))
         except (KeyError, TypeError) as error:
             raise ValueError(f"expected members tick, ms and lateness_ms of recent ({error})") from error
+        if not len(numbers) == len(took_ms) == len(lateness_ms) or not all(map(_is_figure, (*numbers, *took_ms, *lateness_ms))):
+            raise ValueError("expected as many figures in tick, ms and lateness_ms of recent")
+        return [int(n) for n in numbers], [float(ms) for ms in took_ms], [float(ms) for ms in lateness_ms]
+
+
+def _is_figure(value: Any) -> bool:
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return is_number and (value == 0 or LEAST_FIGURE <= abs(value) <= LARGEST_FIGURE)
 
 
 class Recorder:

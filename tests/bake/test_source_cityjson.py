@@ -9,6 +9,7 @@ import pytest
 
 from bake_jobs.cityjson import OBJECT_ALBEDO, SURFACE_ALBEDO
 from bake_jobs.scene_source import load_scene
+from bake_jobs.solids import MAX_RINGS
 from bake_jobs.terrain import GROUND_ALBEDO
 from gi_core.errors import SourceError
 
@@ -112,6 +113,15 @@ def test_a_wall_with_a_window_keeps_its_hole_and_its_direction(tmp_path):
     doubled = np.cross(b - a, c - a)
     assert doubled.sum(axis=0) / 2 == pytest.approx([0, 0, 100 - 16]), "faces south, +Z"
     assert (doubled[:, 2] > 0).all()
+
+
+def test_a_surface_of_more_holes_than_can_be_triangulated_in_time_is_refused_by_name(tmp_path):
+    content = document()
+    name, item = next(iter(content["CityObjects"].items()))
+    ring = [0, 1, 2]
+    item["geometry"] = [{"type": "MultiSurface", "lod": "2", "boundaries": [[ring] * (MAX_RINGS + 1)]}]
+    with pytest.raises(SourceError, match=rf"'{name}': expected a polygon of at most {MAX_RINGS} rings, found {MAX_RINGS + 1}"):
+        load(tmp_path, content)
 
 
 def test_the_highest_level_of_detail_is_read(tmp_path):

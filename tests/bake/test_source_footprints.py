@@ -12,6 +12,7 @@ from bake_jobs.geography import MapFrame
 from bake_jobs.rays import RayScene
 from bake_jobs.scene import scene_digest
 from bake_jobs.scene_source import load_scene
+from bake_jobs.solids import MAX_RINGS
 from bake_jobs.terrain import GROUND_ALBEDO, OUTLIER_M, smooth_heights
 from gi_core.errors import SourceError
 
@@ -205,6 +206,14 @@ def test_a_height_in_a_wrong_type_or_unit_names_its_feature(tmp_path):
         load_scene(write(tmp_path / "a.geojson", square(0, 0, 10, height=5), square(50, 0, 10, height=[5])))
     with pytest.raises(SourceError, match="feature 0: expected a height of at most"):
         load_scene(write(tmp_path / "a.geojson", square(0, 0, 10, height=12_000)))
+
+
+def test_a_polygon_of_more_holes_than_can_be_triangulated_in_time_is_refused_by_name(tmp_path):
+    wide, hole = square(0, 0, 100, height=10), square(0, 0, 1)["geometry"]["coordinates"]
+    wide["geometry"]["coordinates"] += hole * MAX_RINGS
+    file = write(tmp_path / "sieve.geojson", square(300, 0, 20, height=10), wide)
+    with pytest.raises(SourceError, match=rf"feature 1: expected a polygon of at most {MAX_RINGS} rings, found {MAX_RINGS + 1}"):
+        load_footprints(file)
 
 
 def test_two_continents_are_refused_before_their_ground_is_allocated(tmp_path):

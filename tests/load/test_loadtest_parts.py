@@ -1,6 +1,9 @@
 """The load test's arithmetic, files and picture, without a server."""
 
+import asyncio
 import json
+import math
+from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -10,8 +13,9 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from gi_core.errors import InputError
-from server.loadtest_clients import count_pops, read_reply
+from gi_core.errors import InputError, SectorlightError
+from server.loadtest import _ask_clock, _ask_live, _player_name
+from server.loadtest_clients import Watch, count_pops, read_reply
 from server.loadtest_command import checked_url, read_paths, table_of
 from server.loadtest_limits import Limits, missed
 from server.loadtest_plot import _round_up, draw
@@ -157,10 +161,84 @@ def test_addresses() -> None:
 
 @pytest.mark.parametrize(
     "headers",
-    [{}, {"Gi-Volume": "{"}, {"Gi-Volume": "[]"}, {"shape": [6, 4, 8, 8, 3]}, {"shape": [6, 4, 8, 9, 4]}, {"shape": []}, {"Gi-Tick": "x"}],
+    [
+        {},
+        {"Gi-Volume": "{"},
+        {"Gi-Volume": "[]"},
+        {"Gi-Tick": "x"},
+        {"shape": [6, 4, 8, 8, 3]},
+        {"shape": [6, 4, 8, 9, 4]},
+        {"shape": []},
+        {"shape": [6, 4, 8, math.inf, 4]},
+        {"basis": "sh1"},
+        {"basis": "x"},
+        {"scale": math.nan},
+        {"scale": 10**400},
+    ],
 )
 def test_replies_that_do_not_fit_together_are_refused(headers: dict[str, Any]) -> None:
-    facts = {"shape": headers.get("shape", [6, 4, 8, 8, 4]), "scale": 1.0, "basis": "cube", "origin": [0, 0, 0]}
-    given = {} if not headers else {"Gi-Volume": json.dumps(facts), "Gi-Tick": "3"} | {k: v for k, v in headers.items() if k != "shape"}
+    facts = {"shape": [6, 4, 8, 8, 4], "scale": 1.0, "basis": "cube", "origin": [0, 0, 0]}
+    facts |= {name: value for name, value in headers.items() if name in facts}
+    given = {} if not headers else {"Gi-Volume": json.dumps(facts), "Gi-Tick": "3"} | {k: v for k, v in headers.items() if k not in facts}
     with pytest.raises(StreamError):
         read_reply(httpx.Response(200, content=bytes(6 * 4 * 8 * 8 * 4 * 2), headers=given))
+
+
+HUGE, DEEP = "1" + "0" * 400, "[" * 100_000
+STRANGE_FIGURES = {
+    "tick": ["null", HUGE, "1e308", "NaN"],
+    "tick_rate": [HUGE, "1e-320", "-1", "1e308"],
+    "memory_bytes": ["-1e308", HUGE, "{}"],
+    "cache": ['{"hits": 1e308}', "7"],
+    "recent": ["[]", '{"tick": [1e999], "ms": [1], "lateness_ms": [1]}', '{"tick": [1], "ms": [NaN], "lateness_ms": [1]}'],
+}
+
+
+def asked(ask: Callable[[httpx.AsyncClient, Watch], Any], *texts: str) -> Recorder:
+    """What is recorded of a server that gives these replies, in this order."""
+    replies, recorder = iter(texts), Recorder()
+
+    async def ask_all() -> None:
+        transport = httpx.MockTransport(lambda request: httpx.Response(200, text=next(replies)))
+        async with httpx.AsyncClient(transport=transport, base_url="http://x") as http:
+            for at in range(len(texts)):
+                await ask(http, Watch(recorder, lambda at=at: float(at), 0.2))
+
+    asyncio.run(ask_all())
+    return recorder
+
+
+@pytest.mark.parametrize(("name", "value"), [(name, value) for name, values in STRANGE_FIGURES.items() for value in values])
+def test_whatever_a_server_says_of_itself_there_is_a_report_and_a_picture(name: str, value: str) -> None:
+    said = {"tick": "9", "tick_rate": "30", "memory_bytes": "4", "recent": '{"tick": [8], "ms": [1.5], "lateness_ms": [0]}'}
+    texts = ["{" + ", ".join(f'"{key}": {text}' for key, text in members.items()) + "}" for members in (said, said | {name: value})]
+    report = report_of(asked(_ask_live, *texts), SETTING, 3.0, 0.5, False)
+    json.dumps(report, allow_nan=False)
+    draw(report)
+    table_of(report)
+
+
+@pytest.mark.parametrize("text", [DEEP, "[]", "no", "null"])
+def test_what_is_no_object_is_an_error_and_no_crash(text: str) -> None:
+    assert asked(_ask_live, text).total("errors") == 1
+    with pytest.raises(SectorlightError, match="id"):
+        _player_name(httpx.Response(201, text=text))
+
+
+@pytest.mark.parametrize("name", ["", "a\nb", "../x", "\ud800", "x" * 65, 7, None])
+def test_a_player_whose_name_is_no_id_is_refused(name: object) -> None:
+    with pytest.raises(SectorlightError, match="id"):
+        _player_name(httpx.Response(201, text=json.dumps({"id": name})))
+    assert _player_name(httpx.Response(201, json={"id": "loadtest-1"})) == "loadtest-1"
+
+
+@pytest.mark.parametrize("text", [DEEP, "[]", "{}", f'{{"paused": false, "rate": {HUGE}, "time": "2024-06-21T12:00"}}'])
+def test_a_clock_that_makes_no_sense_is_no_jump(text: str) -> None:
+    good = '{"paused": false, "rate": 1, "time": "2024-06-21T12:00:00"}'
+    found = []
+
+    async def ask(http: httpx.AsyncClient, watch: Watch) -> None:
+        found.append(await _ask_clock(http, watch, found[-1] if found else None))
+
+    assert not asked(ask, good, text).jumps
+    assert found[1] == found[0]
