@@ -1,6 +1,7 @@
 """Where the air of rooms meets the open air or that of other rooms: doors and windows, as boxes."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from scipy.ndimage import find_objects, label, uniform_filter
@@ -13,6 +14,13 @@ from gi_core.world import Opening, Room
 
 # An author's box may end before its walls or in them: a way from this far inside it to this far outside it, past walls of common depth.
 INSIDE_M, OUTSIDE_M = 0.3, 0.6
+# Old masonry is thicker. So far outside another room is looked for, where the way there is lined by jambs; else the air between is the
+# street's, as in a gap between two houses whose windows face each other.
+THICKEST_M, THICK_STEP_M = 1.5, 0.1
+# What closes a way that far out, with something so near all around it, is the back of a niche, or a door's own rebate or splayed jamb.
+NICHE_M = 3.0
+# Cells follow a wall to half of one: so near to its sides what lies around a way through it says nothing.
+SIDE_M = 0.25
 # A seam that follows cells may lie so far inside the room, and turn corners there.
 SEAM_M = 2 * ROOM_CELL_M
 # How finely a wall is looked through for where the room behind a door begins.
@@ -30,16 +38,17 @@ _NEAR_CELLS = 1.5
 def with_openings(rays: RayScene, rooms: tuple[Room, ...]) -> tuple[Room, ...]:
     """Rooms with their openings, what nothing closes: of a box in its six faces, of a mesh between cells. Found rooms have those to the
     open air already. A door between two rooms is among the openings of both, as one box from either's side to the other's."""
-    seen = [
-        _face_openings(rays, number, rooms) if room.cells is None else _cell_openings(rays, number, rooms)
-        for number, room in enumerate(rooms, 1)
-    ]
+    seen: list[list[Opening]] = []
+    for number, room in enumerate(rooms, 1):
+        openings = (_face_openings if room.cells is None else _cell_openings)(rays, number, rooms)
+        is_way = [not each.to or _is_lined(rays, each, _through(each, rooms)) for each in openings]
+        seen.append([each if ok else replace(each, to=ROOM_OUTDOORS) for each, ok in zip(openings, is_way, strict=True)])
     doors: list[list[Opening]] = [[] for _ in rooms]
     for one in range(1, len(rooms) + 1):
         for other in sorted({opening.to for opening in seen[one - 1]} - {ROOM_OUTDOORS}):
             back = [opening for opening in seen[other - 1] if opening.to == one]
             if one < other or not back:
-                through = [_through(opening, rooms) for opening in seen[one - 1] if opening.to == other]
+                through = [part for opening in seen[one - 1] if opening.to == other for part in _slices(opening, _through(opening, rooms))]
                 doors[one - 1] += through
                 doors[other - 1] += [replace(door, to=one) for door in through]
     outdoors = [
@@ -50,17 +59,36 @@ def with_openings(rays: RayScene, rooms: tuple[Room, ...]) -> tuple[Room, ...]:
 
 
 def _beyond(rays: RayScene, number: int, rooms: tuple[Room, ...], faces: tuple[Float64, float], way: Float64) -> Int64:
-    """Which room, or 0, lies a little outside faces of a room's air; -1 of one that something closes, or that is in another room.
+    """Which room lies outside faces of a room's air, a little or behind a thick wall, or 0; -1 of one that something closes, or that is
+    in another room.
 
     faces : middles (n, 3) [m], and how far inside them to begin [m]; way : (3,) outward
     """
     middle, inward = faces
     starts = middle - inward * way
-    blocked = rays.occluded(starts, np.tile(way, (len(middle), 1)), np.full(len(middle), inward + OUTSIDE_M))
+    clear = rays.closest(starts, np.tile(way, (len(middle), 1))).distance - inward
     beyond = rooms_of(middle + OUTSIDE_M * way, rooms).astype(np.int64)
+    if len(rooms) > 1:
+        for far in np.arange(OUTSIDE_M, THICKEST_M, THICK_STEP_M) + THICK_STEP_M:
+            going = np.flatnonzero((beyond == ROOM_OUTDOORS) & (clear > far))
+            there = rooms_of(middle[going] + far * way, rooms)
+            beyond[going] = np.where(there == number, ROOM_OUTDOORS, there)
+    ends = np.flatnonzero((beyond == ROOM_OUTDOORS) & (clear > OUTSIDE_M) & (clear <= THICKEST_M))
+    beyond[ends[_is_niche(rays, middle[ends] + (clear[ends, None] - RIM_DEPTH_M) * way, way)]] = -1
     # Where rooms overlap the earlier one ends at its own faces, the other at those.
     elsewhere = (beyond != ROOM_OUTDOORS) & (rooms_of(starts, rooms) != number)
-    return np.where(blocked | elsewhere | (beyond == number), -1, beyond)
+    return np.where((clear <= OUTSIDE_M) | elsewhere | (beyond == number), -1, beyond)
+
+
+def _is_niche(rays: RayScene, place: Float64, way: Float64) -> Bool:
+    """(n,): around which places (n, 3) [m] something is near in all four directions across a way (3,) along an axis."""
+    near = np.ones(len(place), np.bool_)
+    for axis in np.flatnonzero(way == 0):
+        for sign in (-1.0, 1.0):
+            across = np.zeros(3)
+            across[axis] = sign
+            near &= rays.occluded(place, np.tile(across, (len(place), 1)), np.full(len(place), NICHE_M))
+    return near
 
 
 def _face_openings(rays: RayScene, number: int, rooms: tuple[Room, ...]) -> list[Opening]:
@@ -128,15 +156,60 @@ def _through(door: Opening, rooms: tuple[Room, ...]) -> Opening:
     """A door that was found on one room's side of a wall, through the wall to where the other room begins."""
     low, high = np.array(door.minimum), np.array(door.maximum)
     axis = int(np.argmin(high - low))
+    way = np.arange(0.0, THICKEST_M + THROUGH_STEP_M / 2, THROUGH_STEP_M)
+    places = np.tile(_in_door(low, high), (2, len(way), 1))
+    places[0, :, axis], places[1, :, axis] = low[axis] - way, high[axis] + way
+    met = (rooms_of(places.reshape(-1, 3), rooms) == door.to).reshape(2, -1)
+    if met.any():
+        side = int(np.argmin(np.where(met.any(axis=1), met.argmax(axis=1), len(way))))
+        (low, high)[side][axis] = round(places[side, met[side].argmax(), axis], 4)
+    return Opening(point(low), point(high), door.to)
+
+
+def _is_lined(rays: RayScene, flat: Opening, door: Opening) -> bool:
+    """Whether what goes ``through`` a wall is no deeper than walls are that no gap can be in, or has the wall around it all the way.
+
+    flat : the opening in one room's side of the wall; door : through the wall
+    """
+    low, high = np.array(door.minimum), np.array(door.maximum)
+    axis = int(np.argmin(np.subtract(flat.maximum, flat.minimum)))
+    if high[axis] - low[axis] <= OUTSIDE_M:
+        return True
+    along = np.arange(low[axis] + SIDE_M, high[axis] - SIDE_M, THICK_STEP_M)
+    places = np.tile(_in_door(low, high), (len(along), 1))
+    places[:, axis] = along
+    for across in (other for other in range(3) if other != axis):
+        for edge, sign in ((low, -1.0), (high, 1.0)):
+            way = np.zeros(3)
+            way[across] = sign
+            distance = rays.closest(places, np.tile(way, (len(along), 1))).distance
+            if (distance > abs(edge[across] - places[0, across]) + ROOM_CELL_M).any():
+                return False
+    return True
+
+
+def _slices(flat: Opening, door: Opening) -> list[Opening]:
+    """A door as boxes one behind the other, of which each is shortest the way through, as readers tell which way that is.
+
+    flat : the opening in one room's side of the wall; door : through the wall
+    """
+    sides = np.subtract(door.maximum, door.minimum)
+    axis = int(np.argmin(np.subtract(flat.maximum, flat.minimum)))
+    count = int(sides[axis] / np.delete(sides, axis).min()) + 1
+    ends = np.linspace(door.minimum[axis], door.maximum[axis], count + 1).round(4)
+    parts = []
+    for start, stop in pairwise(ends):
+        low, high = np.array(door.minimum), np.array(door.maximum)
+        low[axis], high[axis] = start, stop
+        parts.append(Opening(point(low), point(high), door.to))
+    return parts
+
+
+def _in_door(low: Float64, high: Float64) -> Float64:
+    """The middle (3,) of a door, but above the floor, of one that goes on below it."""
     middle = (low + high) / 2
-    middle[1] = high[1] - (high[1] - low[1]) / 4  # above the floor, of a door that goes on below it
-    for way in np.arange(0.0, OUTSIDE_M, THROUGH_STEP_M):
-        for ends, sign in ((low, -1.0), (high, 1.0)):
-            middle[axis] = ends[axis] + sign * way
-            if rooms_of(middle[None], rooms)[0] == door.to:
-                ends[axis] = round(middle[axis], 4)
-                return Opening(point(low), point(high), door.to)
-    return door
+    middle[1] = high[1] - (high[1] - low[1]) / 4
+    return middle
 
 
 def _to_rim(rays: RayScene, ends: tuple[Float64, Float64], room: tuple[Float64, Float64], axis: int, outward: float) -> Opening:

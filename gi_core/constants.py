@@ -23,7 +23,8 @@ VOXEL_SOLID, VOXEL_OUTDOORS, VOXEL_INDOORS, VOXEL_NO_SECTOR = range(4)
 # Room 0 is outdoors; authored rooms count from 1 in the order of world.toml, then come those that were found.
 ROOM_OUTDOORS = 0
 ROOM_CELL_M = VOXEL_SIZE_M / 8  # of the shape of a found room: two across the narrowest door
-# Indoor and outdoor light mix where an opening fills more than this share of half the view, as seen from so much nearer (contract).
+# Indoor and outdoor light mix where an opening fills more than this share of half the view; in textures of weights as seen from so much
+# nearer (contract).
 OPENING_LEAST_VIEW, OPENING_DEPTH_M = 0.25, VOXEL_SIZE_M / 8
 
 # Coefficients per channel of each directional basis (contract): the ambient cube, and spherical harmonics of order 1 and 2.

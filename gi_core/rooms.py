@@ -169,7 +169,9 @@ def light_shares(position: Float64, rooms: tuple[Room, ...], surface: Float64 | 
         for other in sorted({opening.to for opening in room.openings}):
             # Doors between rooms are among those of both.
             here = near[(own[near] == number) | ((own[near] == ROOM_OUTDOORS) & (other == ROOM_OUTDOORS))]
-            half = opening_nearness(room, surface[here], other) / 2
+            # Openings to the open air lie in walls' inner sides: from the outer ones nothing may be seen of them.
+            nearer = np.where((own[here] == number) | (other != ROOM_OUTDOORS), 0.0, OPENING_DEPTH_M)
+            half = opening_nearness(room, surface[here], other, nearer) / 2
             for inside, lends in ((number, other), (other, number)):
                 seen = (half > 0) & (own[here] == inside)
                 parts.append((here[seen], lends, half[seen]))
@@ -196,20 +198,22 @@ def _in_box(opening: Opening, position: Float64) -> Bool:
     return np.asarray(((position >= opening.minimum) & (position <= opening.maximum)).all(axis=1), np.bool_)
 
 
-def opening_nearness(room: Room, position: Float64, to: int = ROOM_OUTDOORS) -> Float32:
+def opening_nearness(room: Room, position: Float64, to: int = ROOM_OUTDOORS, nearer_m: float | Float64 = 0.0) -> Float32:
     """(n,) 0..1 at positions (n, 3) [m]: 1 in the openings of a room to another, or to the open air, 0 where each fills less than
     OPENING_LEAST_VIEW of half the view.
 
-    An opening is the rectangle across the shortest side of its box, seen from as much nearer as that is deep and OPENING_DEPTH_M; from
-    x and y off its corners, at a distance d, it has a solid angle of the sum of +- atan(x y / (d sqrt(x^2 + y^2 + d^2))).
+    nearer_m : from so much nearer they are seen, at most OPENING_DEPTH_M; a number, or one for each position (n,)
+
+    An opening is the rectangle across the shortest side of its box, seen from as much nearer as that is deep; from x and y off its
+    corners, at a distance d, it has a solid angle of the sum of +- atan(x y / (d sqrt(x^2 + y^2 + d^2))).
     """
-    nearness = np.zeros(len(position), np.float32)
+    nearness, nearer = np.zeros(len(position), np.float32), np.broadcast_to(nearer_m, len(position))
     for opening in (each for each in room.openings if each.to == to):
         low, high = np.array(opening.minimum), np.array(opening.maximum)
         reach = OPENING_DEPTH_M + _reach_of(opening)
         near = np.flatnonzero(((position >= low - reach) & (position <= high + reach)).all(axis=1))
         axis = int(np.argmin(high - low))
-        depth = np.abs(position[near, axis] - (low[axis] + high[axis]) / 2) - (high[axis] - low[axis]) / 2 - OPENING_DEPTH_M
+        depth = np.abs(position[near, axis] - (low[axis] + high[axis]) / 2) - (high[axis] - low[axis]) / 2 - nearer[near]
         depth = np.maximum(depth, 1e-9)
         u, v = (across for across in range(3) if across != axis)
         angle = np.zeros(len(near))
@@ -236,7 +240,8 @@ def weight_lattice(first_voxel: Int64, rooms: tuple[Room, ...], numbers: tuple[i
     """Where a volume's rooms are, and how near their openings, in a quarter of its voxels' size: (2, 64, 128, 128), y, z, x.
 
     Plane 0 is 255 in the rooms of those ``numbers`` and 0 outside them; plane 1 is 255 times ``opening_nearness`` of the closest of them,
-    of openings to the open air or to the room ``to``. In doorways to that one plane 0 is 127.
+    of openings to the open air or to the room ``to``, from OPENING_DEPTH_M nearer: cells lie up to so far from one. In doorways to that
+    room plane 0 is 127.
     """
     shape = tuple(WEIGHT_CELLS * n for n in VOLUME_SHAPE)
     found = np.zeros((2, *shape), np.uint8)
@@ -258,7 +263,7 @@ def weight_lattice(first_voxel: Int64, rooms: tuple[Room, ...], numbers: tuple[i
         for door in (each for each in room.openings if each.to == to != ROOM_OUTDOORS):
             between = _in_box(door, position) & ~holds(rooms[to - 1], position)
             inside = np.where(between, np.maximum(inside, np.float32(127 / 255)), inside)
-        for plane, value in enumerate((inside, opening_nearness(room, position, to))):
+        for plane, value in enumerate((inside, opening_nearness(room, position, to, OPENING_DEPTH_M))):
             here = found[(plane, *part)]
             np.maximum(here, np.round(255 * value.reshape(here.shape)).astype(np.uint8), out=here)
     return found

@@ -59,9 +59,10 @@ def volume(request: Request, service: ServiceDep, query: Annotated[VolumeQuery, 
     `kind=interior&weight=1`: what makes a step through a door smooth, in cells of a quarter voxel, uint8 (2, 64, 128, 128). Plane 0, read
     at the nearest cell, is 255 in the rooms and 0 outside; plane 1, read linearly, n = 0..1 as 0..255, tells how much an opening fills the
     view. The share of the interior volume is 1 - n / 2 inside and n / 2 outside: sharp at walls, continuous through openings. Read plane 0
-    where volumes are sampled, plane 1 on the surface that is lit, 2 cm off it. From the openings of `/v1/world` n can be had exactly: of
-    each box take the rectangle across its shortest side, and its solid angle from 0.390625 m nearer than one is; n = clamp((angle / 2 pi -
-    0.25) / 0.75).
+    where volumes are sampled, plane 1 on the surface that is lit, 2 cm off it. n is the largest clamp((angle /
+    2 pi - 0.25) / 0.75) of all boxes of openings in `/v1/world`: of each take the rectangle across its shortest side, and the solid angle
+    from 0.390625 m nearer than the cell is. Worked out by oneself, for a point in a room or beyond a door, it is better with the angle from
+    where one is: cells lie up to so far from an opening, and one to the open air is told of in the wall's inner side.
     `&room=A&to=B` is the same for the doors from A to another room B, `doors` of `/v1/world`, with both rooms' volumes: the share of B is
     n / 2 in A, that of A n / 2 in B, and each has a half in the doorway, where plane 0 is 127. Where a room has doors and other openings
     near, take all of their shares from it.

@@ -1,14 +1,16 @@
 """Rooms that are found: what is enclosed and can be walked into is one, what the sky or the street reaches is not."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from bake_jobs.air_basins import find_basins
+from bake_jobs.room_openings import THICKEST_M
 from bake_jobs.room_search import world_rooms
 from bake_jobs.scene_source import load_scene
-from gi_core.constants import ROOM_CELL_M
+from gi_core.constants import OPENING_LEAST_VIEW, ROOM_CELL_M
 from gi_core.errors import SourceError
 from gi_core.rooms import holds, light_shares, rooms_of
 from gi_core.world import Room
@@ -123,6 +125,80 @@ def test_rooms_that_touch_or_overlap_open_into_each_other_where_one_ends(ground)
             (seam,) = room.openings
             assert seam.to == to
             np.testing.assert_allclose((seam.minimum, seam.maximum), ((15, -2.79, 20), (15, 2.79, 26)), atol=0.011)
+
+
+def front_and_back(block, thick, door=(2.0, -0.1, 3.0, 2.0)):
+    """The scene of a house of two rooms, so thick a wall between them and a door in it; and the rooms, as an author would draw them."""
+    block = house(block, (10, 20), (22, 26))
+    block.wall((16, 19.9), (16, 26.1), 2.8, [door], thick=thick)
+    front, back = (
+        Room("front", (10.0, 0.0, 20.0), (16 - thick / 2, 2.79, 26.0)),
+        Room("back", (16 + thick / 2, 0.0, 20.0), (22.0, 2.79, 26.0)),
+    )
+    return block.scene(rooms=(front, back)), (front, back)
+
+
+@pytest.mark.parametrize("thick", [0.6, 0.8, 1.2, THICKEST_M - 0.1])
+@pytest.mark.parametrize("is_drawn", [True, False])
+def test_a_door_goes_through_a_wall_of_old_masonry(ground, thick, is_drawn):
+    scene, drawn = front_and_back(ground, thick)
+    front, back = world_rooms(scene, "none") if is_drawn else world_rooms(replace(scene, rooms=()), "open")
+    for room, box in zip((front, back), drawn, strict=True):
+        np.testing.assert_allclose((room.minimum, room.maximum), (box.minimum, box.maximum), atol=2e-3)
+    # One box behind the other from side to side, each as a door through a thin wall is: shortest along the way.
+    doors = [opening for opening in front.openings if opening.to]
+    assert ([each.to for each in back.openings], len(front.openings) - len(doors)) == ([1] * len(doors), 2)
+    np.testing.assert_allclose(doors[0].minimum, (16 - thick / 2, -2, 21.9), atol=0.012)
+    np.testing.assert_allclose(doors[-1].maximum, (16 + thick / 2, 2, 22.9), atol=0.012)
+    for door, behind in pairwise(doors):
+        assert door.maximum[0] == behind.minimum[0]
+    for door in doors:
+        assert np.argmin(np.subtract(door.maximum, door.minimum)) == 0
+    x = np.arange(12.0, 20.0, 0.05)
+    way = np.stack([x, np.zeros(len(x)), np.full(len(x), 22.4)], axis=1)
+    shares = light_shares(way, (front, back))
+    assert not shares.of(0, len(x)).any()
+    step = 0.05 * np.hypot(0.5, 2) / (0.5 * 2) / (np.pi * (1 - OPENING_LEAST_VIEW))
+    assert np.abs(np.diff(shares.of(1, len(x)))).max() <= step * 1.01
+
+
+def test_where_a_door_ends_is_told_of_walls_up_to_a_limit(ground):
+    scene, _ = front_and_back(ground, THICKEST_M + 0.1)
+    assert [[each.to for each in room.openings] for room in world_rooms(scene, "none")] == [[0, 0, 0], [0]]
+
+
+def test_windows_that_face_each_other_over_a_gap_are_no_door(ground):
+    """Two houses 0.8 m apart, their walls 0.2 m thick: between the windows is the street's air, for nothing lines the way there."""
+    west, east = Room("west", (10.0, 0.0, 20.0), (16.0, 2.79, 26.0)), Room("east", (17.2, 0.0, 20.0), (23.0, 2.79, 26.0))
+    block = ground
+    for room, x in ((west, 16.1), (east, 17.1)):
+        (x0, _, z0), (x1, top, z1) = room.minimum, room.maximum
+        block.wall((x, z0 - 0.2), (x, z1 + 0.2), top, [(2.1, 0.9, 3.5, 2.2)])
+        block.box((x0, top, z0 - 0.2), (x1, top + 0.3, z1 + 0.2))
+        for z in (z0 - 0.1, z1 + 0.1):
+            block.wall((x0, z), (x1, z), top)
+    block.wall((9.9, 19.8), (9.9, 26.2), 2.79).wall((23.1, 19.8), (23.1, 26.2), 2.79)
+    for room in world_rooms(block.scene(rooms=(west, east)), "none"):
+        assert [opening.to for opening in room.openings] == [0]
+    # With the gap walled up around the windows it is a wall, and what goes through it a door.
+    block.wall((16.6, 19.8), (16.6, 26.2), 2.79, [(2.1, 0.9, 3.5, 2.2)], thick=0.82)
+    for room, to in zip(world_rooms(block.scene(rooms=(west, east)), "none"), (2, 1), strict=True):
+        (door,) = room.openings
+        assert door.to == to
+        np.testing.assert_allclose((door.minimum, door.maximum), ((16, 0.9, 21.9), (17.2, 2.2, 23.3)), atol=0.012)
+
+
+def test_a_niche_and_a_rebate_lead_nowhere(ground):
+    """A door 1.4 m wide that narrows to 0.8 m in the wall's farther part, and beside it a niche 0.7 m deep."""
+    block = house(ground, (10, 20), (22, 26), door=False, window=False)
+    block.wall((15.8, 19.9), (15.8, 26.1), 2.8, [(1.0, -0.1, 2.4, 2.0), (4.0, 0.5, 5.0, 2.0)], thick=0.7)
+    block.wall((16.3, 19.9), (16.3, 26.1), 2.8, [(1.3, -0.1, 2.1, 2.0)], thick=0.3)
+    front, back = Room("front", (10.0, 0.0, 20.0), (15.45, 2.79, 26.0)), Room("back", (16.45, 0.0, 20.0), (22.0, 2.79, 26.0))
+    for rooms in ((front, back), (back, front)):
+        for room, to in zip(world_rooms(block.scene(rooms=rooms), "none"), (2, 1), strict=True):
+            assert {opening.to for opening in room.openings} == {to}
+    (alone,) = world_rooms(block.scene(rooms=(front,)), "none")
+    assert [opening.to for opening in alone.openings] == [0]  # the door, into air of no room
 
 
 def test_what_the_street_or_the_sky_reaches_is_no_room(build):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_edt
 
-from gi_core.constants import VOXEL_OUTDOORS
+from gi_core.constants import OPENING_DEPTH_M, VOXEL_OUTDOORS
 from gi_core.errors import InputError
 from gi_core.rooms import find_room, light_shares, nearest, opening_nearness, outdoor_blend, rooms_of, rooms_with_light, weight_lattice
 from gi_core.world import Opening, Room
@@ -133,7 +133,7 @@ def test_a_window_and_a_door_have_each_their_share():
     """Where both are in view, and beside the window, on the street."""
     near = np.array([[3.0, 1.6, 0.5], [3.0, 1.6, -0.5], [9.5, 1.0, 4.0]])
     found = mixed(near)
-    window, door = opening_nearness(HALL, near), opening_nearness(HALL, near, 2)
+    window, door = opening_nearness(HALL, near, nearer_m=np.array([0, OPENING_DEPTH_M, 0])), opening_nearness(HALL, near, 2)
     assert window.min() == door[:2].max() == 0
     np.testing.assert_allclose(found[0], [window[0] / 2, 1 - window[0] / 2, 0], atol=1e-6)
     np.testing.assert_allclose(found[1], [1 - window[1] / 2, window[1] / 2, 0], atol=1e-6)
@@ -149,6 +149,17 @@ def test_a_window_and_a_door_have_each_their_share():
     assert shares.of(1, 1)[0] == pytest.approx(1 - open_air / 2 - study / 2)
 
 
+def test_an_opening_fills_of_the_view_what_its_solid_angle_is():
+    """Of a cube's faces each fills a sixth of what its middle sees: 1 m before a square of 2 m, a third of half the view."""
+    room = Room("hall", (0, 0, 0), (10, 4, 8), (Opening((4.0, 1.0, 0.0), (6.0, 3.0, 0.0)),))
+    before = np.array([[5.0, 2.0, 1.0], [5.0, 2.0, -1.0]])
+    np.testing.assert_allclose(opening_nearness(room, before), (1 / 3 - 1 / 4) / (3 / 4), atol=1e-6)
+    # Textures have it from an eighth of a voxel nearer, and so it is on the street, where the wall's outer side is.
+    nearer = opening_nearness(room, before * [1, 1, 1 - OPENING_DEPTH_M])
+    np.testing.assert_allclose(opening_nearness(room, before, nearer_m=OPENING_DEPTH_M), nearer, atol=1e-6)
+    np.testing.assert_allclose(light_shares(before, (room,)).of(1, 2), [1 - 1 / 18, nearer[1] / 2], atol=1e-6)
+
+
 def test_a_point_a_hair_behind_a_wall_is_the_rooms_that_it_is_seen_from():
     """The ceiling met behind the edge of a wall: 0.4 mm in it. In the wall's middle it is not."""
     assert mixed(np.array([[5.0, 2.0, -4e-4], [18.0004, 1, 4], [5, 2, -0.01]])).argmax(axis=1).tolist() == [1, 2, 0]
@@ -161,7 +172,9 @@ def test_a_lattice_tells_of_the_doors_to_one_room():
     y, z, x = np.meshgrid(*(0.78125 * (np.arange(n) + 0.5) - 6.25 for n in (64, 128, 128)), indexing="ij")
     at = np.stack([x, y, z], axis=-1)
     for weight, to in zip(both, (0, 2), strict=True):
-        np.testing.assert_allclose(weight[1].reshape(-1), 255 * opening_nearness(pair[0], at.reshape(-1, 3), to), atol=0.5001)
+        np.testing.assert_allclose(
+            weight[1].reshape(-1), 255 * opening_nearness(pair[0], at.reshape(-1, 3), to, OPENING_DEPTH_M), atol=0.5001
+        )
         assert weight[1].any()
     between = ((at >= door.minimum) & (at <= door.maximum)).all(axis=-1)
     assert between.any()

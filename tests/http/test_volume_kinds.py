@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gi_core.constants import VOLUME_SHAPE
+from gi_core.constants import OPENING_DEPTH_M, VOLUME_SHAPE
 from gi_core.dataset import Dataset, write_world
 from gi_core.rooms import opening_nearness
 from gi_core.volume import Volume
@@ -325,7 +325,7 @@ def test_a_weight_to_another_room_is_of_the_doors_between_them(serving: Any, cit
         facts = get(client, inside, to="2")[1]
         grid = np.meshgrid(*(np.arange(n) for n in to_the_room.shape[1:]), indexing="ij")
         at = np.stack([grid[axis] for axis in (2, 0, 1)], axis=-1) * facts["voxel_size"] + facts["origin"]
-        near = opening_nearness(rooms[0], at.reshape(-1, 3), 2).reshape(at.shape[:-1])
+        near = opening_nearness(rooms[0], at.reshape(-1, 3), 2, OPENING_DEPTH_M).reshape(at.shape[:-1])
         np.testing.assert_allclose(to_the_room[1], 255 * near, atol=0.51)
         assert to_the_room[1].any()
         # What is asked for without `to` is what it was before there were doors.
