@@ -34,7 +34,7 @@ from gi_core.layout import DIRECTIONAL_LIGHT, MAX_DIRECTIONAL_LIGHTS
 from gi_core.light_geometry import ShadowGeometry
 from gi_core.light_needs import WHOLLY, LightNeeds
 from gi_core.light_surfels import SurfelLights
-from gi_core.live_sector import BURST_CHANGE, BURST_PASSES, LiveLight, LiveSector
+from gi_core.live_sector import AHEAD_TIMES, BURST_CHANGE, BURST_PASSES, HURRIED_TIMES, LiveLight, LiveSector
 from gi_core.live_shadows import LiveShadows
 from gi_core.live_volume import PublishedVolume
 from gi_core.live_volumes import LiveVolumes
@@ -193,7 +193,12 @@ class LiveWorld:
 
     def undisturbed(self) -> AbstractContextManager[None]:
         """For a tick: meanwhile threads that load and plan stand still, unless somebody looks at sectors that are not there."""
-        return nullcontext() if self.plan is not None and self.plan.missing else self._right_of_way.taken()
+        return nullcontext() if self._is_missing_some else self._right_of_way.taken()
+
+    @property
+    def _is_missing_some(self) -> bool:
+        """Whether somebody looks at sectors that are not there."""
+        return self.plan is not None and bool(self.plan.missing)
 
     def warm_up(self) -> None:
         """Compile and run every kernel that light may ask for, on the dataset's smallest lit sector: a first run takes seconds, later
@@ -244,7 +249,7 @@ class LiveWorld:
         assert light is not None  # ticks ask for sectors, and have light
         with self._device.beside():
             placed = self._new_sector(sector)
-            placed.light_ahead(self._relighter_ahead, light)
+            placed.light_ahead(self._relighter_ahead, light, HURRIED_TIMES if self._is_missing_some else AHEAD_TIMES)
             if self._shadows is not None and light.sun_is_up:
                 placed.make_room_for_samples()
         return placed

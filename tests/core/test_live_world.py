@@ -49,6 +49,20 @@ def test_a_volume_that_moved_shows_the_very_bytes_of_one_that_always_stood_there
         np.testing.assert_array_equal(shown.mask, query.mask)
 
 
+@pytest.mark.parametrize(("axis", "low", "high"), [(0, -45.0, 60.0), (1, 2.0, 80.0), (1, 2.0, 130.0), (2, -15.0, 90.0)])
+def test_a_player_who_jumps_by_more_than_a_volume_sees_the_very_bytes_of_a_query(world, engine, axis, low, high):
+    run, lighting = Run(world), engine.lighting("12:00", "clear")
+    light = light_of(world, lighting)
+    run.settle(at(STREET), light)
+    for level in (low, high, low):
+        place = STREET.copy()
+        place[axis] = level
+        run.tick(at(place), light)
+        query, shown = engine.volume(place, lighting), world.published("p0")
+        np.testing.assert_array_equal(shown.values, query.values)
+        np.testing.assert_array_equal(shown.mask, query.mask)
+
+
 @pytest.mark.parametrize("basis", ["cube", "sh1", "sh2"])
 @pytest.mark.parametrize("settings", [NEUTRAL, Settings(bounce_factor=2.0, ambient_up=(10.0, 20.0, 30.0))], ids=["neutral", "gains"])
 def test_volumes_in_each_basis_are_the_very_bytes_of_a_query(basis, settings):
