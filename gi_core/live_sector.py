@@ -199,7 +199,6 @@ class LiveSector:
         self.set_lamps(light, wait=True)
         for _ in range(times):
             give_way()
-            self.light(light, is_read=False)
             relighter.relight([self.resident], light.given, AHEAD_PASSES)
             self.moved_ahead = self.measure()
             if self.moved_ahead <= SETTLED_CHANGE:
