@@ -38,13 +38,15 @@ ROOF_ALBEDO = (0.3, 0.3, 0.3)
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """One polygon of a feature. rings: outer, then holes, (n, 2) longitude and latitude, closed as in the file."""
+    """One polygon of a feature. rings: outer, then holes, (n, 2) longitude and latitude, closed as in the file; is_guessed: whether its
+    height is, since the feature has none that can be read."""
 
     rings: tuple[Float64, ...]
     building: str
     base: float
     bottom: float
     top: float
+    is_guessed: bool
 
 
 def load_footprints(path: Path, frame: MapFrame | None = None) -> SourceContent:
@@ -76,7 +78,11 @@ def load_footprints(path: Path, frame: MapFrame | None = None) -> SourceContent:
         frame.north_degrees,
         source="given",
     )
-    return SourceContent(join_meshes([*meshes, terrain.mesh()]), location)
+    guessed = sum(part.is_guessed for part in parts)
+    note = (
+        f"{path}: {guessed:,} of {len(parts):,} footprints have no height in metres and no building:levels; {DEFAULT_HEIGHT_M:g} m is taken"
+    )
+    return SourceContent(join_meshes([*meshes, terrain.mesh()]), location, notes=(note,) if guessed else ())
 
 
 def _read_parts(path: Path) -> list[_Part]:
@@ -100,7 +106,8 @@ def _read_parts(path: Path) -> list[_Part]:
         if not isinstance(properties, dict):
             raise SourceError(f"{where}: expected properties to be an object, found {type(properties).__name__}")
         base = _metres(properties, "base", where) or 0.0
-        height = _height(properties, where)
+        known = _height(properties, where)
+        height = DEFAULT_HEIGHT_M if known is None else known
         bottom = _metres(properties, "min_height", where) or 0.0
         if height <= bottom:
             continue
@@ -110,7 +117,7 @@ def _read_parts(path: Path) -> list[_Part]:
             points += sum(len(ring) for ring in rings)
             if points > MAX_POINTS:
                 raise SourceError(f"{path}: expected at most {MAX_POINTS:,} points, found more; split the file")
-            parts.append(_Part(rings, building, base, base + bottom, base + height))
+            parts.append(_Part(rings, building, base, base + bottom, base + height, known is None))
     if not parts:
         raise SourceError(f"{path}: expected footprints (Polygon or MultiPolygon with a height above 0), found none")
     return parts
@@ -137,11 +144,14 @@ def _polygons(geometry: Any, where: str) -> Iterator[tuple[Float64, ...]]:
         raise SourceError(f"{where}: expected rings of [longitude, latitude] numbers ({error})") from error
 
 
-def _height(properties: dict[str, Any], where: str) -> float:
+def _height(properties: dict[str, Any], where: str) -> float | None:
+    """[m], or None where a feature has none that can be read."""
     height = _metres(properties, "height", where)
     if height is None:
         levels = _metres(properties, "building:levels", where)
-        height = DEFAULT_HEIGHT_M if levels is None else levels * LEVEL_HEIGHT_M
+        if levels is None:
+            return None
+        height = levels * LEVEL_HEIGHT_M
     if height > MAX_HEIGHT_M:
         raise SourceError(f"{where}: expected a height of at most {MAX_HEIGHT_M:g} m, found {height:g}; heights are metres")
     return height

@@ -128,6 +128,8 @@ def bake(
     if output.exists() and not output.is_dir():
         raise InputError(f"--output {output}: expected a folder, found a file")
     scene = load_scene(source)
+    for note in scene.notes:
+        console.print(note, highlight=False, soft_wrap=True)
     table = SunTable.build(scene.location, settings.sun_declination_step_degrees, settings.sun_hour_step_degrees)
     bake_id = _bake_id(scene, settings, seed)
     wanted = _chosen(SectorCutter(scene).sectors(), sectors)

@@ -62,6 +62,7 @@ class SourceContent:
     """What one source file holds, before it is cleaned and joined with others. location is None when the source knows no place.
 
     search : which enclosed air is to be found as rooms beside the authored ones: "none", "open" (with openings), or "all"
+    notes : what was guessed for want of better, a line each, for whoever bakes
     """
 
     mesh: Mesh
@@ -72,6 +73,7 @@ class SourceContent:
     name: str = ""
     decals: tuple[Decal, ...] = ()
     search: Search = "none"
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +84,7 @@ class Scene:
     triangles : (m, 3) int32, counter-clockwise seen from outside where the source knows an outside
     albedo : (m, 3) float32, linear sRGB, 0..ALBEDO_MAX
     emission : (m, 3) float32 [cd m^-2]
+    notes : as SourceContent's
     """
 
     vertices: Float64
@@ -95,6 +98,7 @@ class Scene:
     hints: tuple[ProbeHint, ...] = ()
     dropped: DroppedTriangles = field(default_factory=DroppedTriangles)
     decals: tuple[Decal, ...] = ()
+    notes: tuple[str, ...] = ()
 
     @property
     def bounds(self) -> Float64:
@@ -123,7 +127,7 @@ def join_meshes(meshes: Sequence[Mesh]) -> Mesh:
 
 
 def scene_digest(scene: Scene) -> str:
-    """32 hexadecimal digits that identify all of a scene that its sectors depend on: not its name, decals, openings and dropped counts."""
+    """32 hexadecimal digits that identify all of a scene that its sectors depend on: not its name, decals, openings, notes, dropped counts."""
     h = hashlib.blake2b(digest_size=16)
     for values, dtype in (
         (scene.vertices, np.dtype("<f8")),

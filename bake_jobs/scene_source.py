@@ -50,6 +50,7 @@ def load_scene(source: str | Path) -> Scene:
         content.hints,
         dropped,
         content.decals,
+        content.notes,
     )
     return dataclasses.replace(scene, rooms=world_rooms(scene, content.search))
 

@@ -105,7 +105,8 @@ def load_world_file(path: Path, load: Loader) -> SourceContent:
         if len(placed) > 1:
             raise SourceError(f"{path}: expected a [location] to place {len(placed)} georeferenced sources in one world, found none")
         location = placed[0].location if placed else dataclasses.replace(Location(), north_degrees=north)
-    return SourceContent(join_meshes([content.mesh for content in sources]), location, rooms, lamps, hints, name, decals, search)
+    notes = tuple(note for content in sources for note in content.notes)
+    return SourceContent(join_meshes([content.mesh for content in sources]), location, rooms, lamps, hints, name, decals, search, notes)
 
 
 def _location(table: Table, north: float) -> Location:

@@ -122,6 +122,17 @@ def test_openstreetmap_heights(tmp_path):
     assert middle[4][:, 1].max() == pytest.approx(9.6)
 
 
+def test_guessed_heights_are_counted(tmp_path):
+    known = square(0, 0, 10, height="12 m"), square(100, 0, 10, **{"building:levels": "5"})
+    guessed = square(200, 0, 10), square(300, 0, 10, height="tall"), square(400, 0, 10, height=float("nan"))
+    path = write(tmp_path / "some.geojson", *known, *guessed)
+    world = tmp_path / "world.toml"
+    world.write_text('[[source]]\npath = "some.geojson"\n')
+    expected = f"{path}: 3 of 5 footprints have no height in metres and no building:levels; 9.6 m is taken"
+    assert load_scene(path).notes == load_scene(world).notes == (expected,)
+    assert load_scene(write(tmp_path / "known.geojson", *known)).notes == ()
+
+
 def test_sloping_ground_meets_every_wall(tmp_path):
     rng = np.random.default_rng(2)
     features = []
