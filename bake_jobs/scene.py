@@ -127,7 +127,7 @@ def join_meshes(meshes: Sequence[Mesh]) -> Mesh:
 
 
 def scene_digest(scene: Scene) -> str:
-    """32 hexadecimal digits that identify all of a scene that its sectors depend on: not name, decals, openings, notes and dropped counts."""
+    """32 hexadecimal digits of all that a scene's sectors depend on: not its name, decals, openings, notes and dropped counts."""
     h = hashlib.blake2b(digest_size=16)
     for values, dtype in (
         (scene.vertices, np.dtype("<f8")),
