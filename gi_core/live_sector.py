@@ -175,6 +175,8 @@ class LiveSector:
             before = self.lamps.buffer
             self.lamps.set_static(light.static_lamps)
             self.lamps.set_dynamic(light.dynamic_lamps)
+            # The geometry on the device is shared with threads that have another queue.
+            self._device.queue.finish()
         finally:
             self._tracing.release()
         if before is not None or self.lamps.buffer is not None:
