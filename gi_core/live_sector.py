@@ -32,9 +32,9 @@ from gi_core.world import Lamp
 # After a change this large, as a share, a relight makes several passes where somebody looks, so that bounces follow at once.
 BURST_CHANGE = 0.05
 BURST_PASSES = 3
-# Before a sector is resident: passes at a stretch, and how often at most. After eight, bounces are within half a percent of the end. Where
-# others wait for the loader it is half as many: what later bounces add is then a twentieth, which comes while the sector fades in.
-AHEAD_PASSES, AHEAD_TIMES, HURRIED_TIMES = 2, 4, 2
+# Before a sector is resident: passes at a stretch, and how often at most. After eight, bounces are within half a percent of the end, for a
+# quarter of the loader's time. Where others wait for it it is once: later bounces come while the sector fades in.
+AHEAD_PASSES, AHEAD_TIMES, HURRIED_TIMES = 2, 4, 1
 # A second at 30 Hz, so that nothing pops when a sector arrives late, or when its sun's visibility has another source: in half of that, a
 # voxel that ends ten times as bright moves by a third in its first ticks.
 FADE_TICKS = 30

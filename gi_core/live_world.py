@@ -52,6 +52,8 @@ from gi_core.world import Lamp
 DEFAULT_BUDGET_BYTES = 512 << 20
 # A tick that has taken this long [ms] leaves planning to later ones, at most so often on end. Sectors are planned for seconds ahead.
 LONG_TICK_MS, MOST_PUT_OFF = 1.5, 3
+# While a volume gets within this [s] to a sector that is not there, those that are loaded leave most of their light to ticks.
+HURRY_S = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,12 +195,7 @@ class LiveWorld:
 
     def undisturbed(self) -> AbstractContextManager[None]:
         """For a tick: meanwhile threads that load and plan stand still, unless somebody looks at sectors that are not there."""
-        return nullcontext() if self._is_missing_some else self._right_of_way.taken()
-
-    @property
-    def _is_missing_some(self) -> bool:
-        """Whether somebody looks at sectors that are not there."""
-        return self.plan is not None and bool(self.plan.missing)
+        return nullcontext() if self.plan is not None and self.plan.missing else self._right_of_way.taken()
 
     def warm_up(self) -> None:
         """Compile and run every kernel that light may ask for, on the dataset's smallest lit sector: a first run takes seconds, later
@@ -249,7 +246,8 @@ class LiveWorld:
         assert light is not None  # ticks ask for sectors, and have light
         with self._device.beside():
             placed = self._new_sector(sector)
-            placed.light_ahead(self._relighter_ahead, light, HURRIED_TIMES if self._is_missing_some else AHEAD_TIMES)
+            is_hurried = self.plan is not None and self.streamer.lacks_within(HURRY_S, self.plan.needs)
+            placed.light_ahead(self._relighter_ahead, light, HURRIED_TIMES if is_hurried else AHEAD_TIMES)
             if self._shadows is not None and light.sun_is_up:
                 placed.make_room_for_samples()
         return placed

@@ -15,7 +15,7 @@ from gi_core.dataset import SectorFacts, WorldInfo
 from gi_core.grid import SectorIndex
 from gi_core.live_sector import LiveSector
 from gi_core.sector import Sector
-from gi_core.stream_need import SectorTable
+from gi_core.stream_need import Needs, SectorTable
 from gi_core.stream_plan import StreamOptions, StreamPlan, StreamState, plan_streaming, retry_delay_s
 
 log = logging.getLogger("sectorlight.stream")
@@ -113,6 +113,10 @@ class Streamer:
     def is_overfull(self) -> bool:
         """Whether sectors take more than the budget, since one has turned out larger: the next step must make them fit."""
         return self._state.used_bytes(self.table) > self._options.budget_bytes
+
+    def lacks_within(self, seconds: float, needs: Needs) -> bool:
+        """Whether a volume gets to a sector that is not resident within so many seconds. From any thread."""
+        return bool(((needs.ahead_s < seconds) & (self._state.resident_bytes == 0)).any())
 
     def take_over(self) -> list[SectorIndex]:
         """Make resident what loaders have finished; those sectors. Failures are noted, to be tried again later."""
