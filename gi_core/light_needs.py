@@ -51,6 +51,10 @@ class LightNeeds:
         if light is not self._light:
             self._light = None
 
+    def at_most(self, row: int) -> float:
+        """How far a sector may be from its light, as of the last ``changes``."""
+        return float(max(self._change[row], self._moved[row]))
+
     def changes(self, rows: Int64, light: LightVector) -> Float64:
         """(k,) for some rows: how far each is from its light, by its bounces or by what the light has changed since its last relight.
 

@@ -276,7 +276,7 @@ class LiveWorld:
         read = [index in self.volumes.looked_at for index in indices]
         for sector, is_read in zip(sectors, read, strict=True):
             sector.light(light, is_read)
-        passes = [BURST_PASSES if is_read and changes[k] > BURST_CHANGE else 1 for k, is_read in zip(chosen, read, strict=True)]
+        passes = [BURST_PASSES if is_read and needs.at_most(rows[k]) > BURST_CHANGE else 1 for k, is_read in zip(chosen, read, strict=True)]
         if sectors:
             self._relighter.relight([sector.resident for sector in sectors], light.given, passes)
         report.passes = sum(passes)
