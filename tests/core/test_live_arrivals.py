@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from live_run import EAST, GOLDEN, LATE_S, STREET, Run, at, is_exact, light_of
 
-from gi_core import stream
+from gi_core import live_world, stream
 from gi_core.dataset import Dataset, sector_path
 from gi_core.engine import Engine
 from gi_core.grid import SectorIndex
@@ -37,7 +37,8 @@ def test_a_new_players_first_volume_waits_for_its_sectors(world, engine):
     assert np.abs(late - first.values).max() <= 0.02 * late.max()
 
 
-def test_a_sector_is_lit_when_it_arrives(world, engine):
+def test_a_sector_is_lit_when_it_arrives(world, engine, monkeypatch):
+    monkeypatch.setattr(live_world, "HURRY_S", -1.0)  # with time for all of its bounces
     run, light = Run(world), light_of(world, engine.lighting("12:00", "clear"))
     residents = world.streamer.residents
     run.until(at(STREET), light, lambda report: len(residents) == 2)
