@@ -42,8 +42,10 @@ def plan_tick(tick: int, relit_at: Int64, change: Float64, away_m: Float64, *, p
     if places < 2:
         raise ValueError(f"expected two places or more, got {places}")
     need = relight_need(tick, relit_at, change, away_m)
+    if not need.any():
+        return ()
     chosen: list[int] = []
-    for candidates in (np.where(away_m == 0, need, 0.0), *(need for _ in range(places))) if need.any() else ():
+    for candidates in (np.where(away_m == 0, need, 0.0), *(need for _ in range(places))):
         if len(chosen) == places:
             break
         best = int(candidates.argmax())
