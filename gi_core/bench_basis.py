@@ -88,7 +88,7 @@ def _fills(device: Device, source: str, target: str) -> Callable[[], None]:
     for box in plan_boxes(np.array([4, 0, 4])):
         record = box_record(box, resident.sector)
         record["sector_first"][0, [0, 2]] = 0
-        records.append((record, (min(int(box.size[0]), 20), int(box.size[1]), min(int(box.size[2]), 20))))
+        records.append((record, (min(box.size[0], 20), box.size[1], min(box.size[2], 20))))
 
     def fill() -> None:
         for record, extent in records:

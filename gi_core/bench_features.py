@@ -154,7 +154,7 @@ class _Volumes:
     def outdoor(self, pair: Pair) -> None:
         """Fill the volume, and read it."""
         for resident in pair:
-            resident.fill_volume(box_record(self._box, resident.sector), tuple(self._box.size.tolist()), self._target)
+            resident.fill_volume(box_record(self._box, resident.sector), self._box.size, self._target)
         self._device.read(self._target, self._values)
 
     def fog(self, pair: Pair) -> None:

@@ -33,7 +33,7 @@ def bench_fill(device: Device, rounds: int = 100) -> Measurement:
     for box in boxes:
         record = box_record(box, resident.sector)
         record["sector_first"][0, [0, 2]] = 0
-        records.append((record, (min(int(box.size[0]), 20), int(box.size[1]), min(int(box.size[2]), 20))))
+        records.append((record, (min(box.size[0], 20), box.size[1], min(box.size[2], 20))))
 
     def fill() -> None:
         for record, size in records:

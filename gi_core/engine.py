@@ -346,8 +346,7 @@ class Engine:
         resident = self._lit_resident(box.index, light)
         sector = resident.sector
         if sector.probe_count:
-            size = tuple(int(n) for n in box.size)
-            resident.fill_volume(box_record(box, sector), size, target, resident.converted(basis), basis)
+            resident.fill_volume(box_record(box, sector), box.size, target, resident.converted(basis), basis)
         mask[box_slices(box)] = box_mask(box, sector)
         return sector.probe_count > 0
 

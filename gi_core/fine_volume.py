@@ -21,13 +21,13 @@ def interpolated(coarse: Volume, first_voxel: Int64) -> tuple[Float32, UInt8]:
 
 def merge(grid: ResidentGrid, box: SectorBox, filled: Float32, values: Float32, mask: UInt8) -> None:
     """Take over into a volume (B, 16, 32, 32, 3) what was filled where there are fine voxels, and into its mask what they are."""
-    (x, y, z), (nx, ny, nz) = (box.lattice_first - grid.first).tolist(), box.size.tolist()
+    (x, y, z), (nx, ny, nz) = np.subtract(box.lattice_first, grid.first).tolist(), box.size
     low, high = max(-y, 0), min(grid.kind.shape[0] - y, ny)
     if low >= high:
         return
     here = (slice(y + low, y + high), slice(z, z + nz), slice(x, x + nx))
     _, rows, columns = box_slices(box)
-    there = (slice(int(box.volume_first[1]) + low, int(box.volume_first[1]) + high), rows, columns)
+    there = (slice(box.volume_first[1] + low, box.volume_first[1] + high), rows, columns)
     mask[there] = grid.kind[here]
     has_light = grid.has_light[here]
     values[(slice(None), *there)][:, has_light] = filled[(slice(None), *there)][:, has_light]

@@ -24,7 +24,7 @@ class LightNeeds:
         self._scale: Float64 = np.zeros(sectors)
         self._light: LightVector | None = None
         self._moved: Float64 = np.zeros(sectors)
-        """(n,) what ``_light`` has changed since each sector's last relight."""
+        """(n,) what ``_light`` has changed since the last relight of each sector that is there."""
         self._share: Float64 = np.ones(sectors)
         """(n,) how much of that its probes move by, LEAST_SHARE at least."""
 
@@ -56,13 +56,14 @@ class LightNeeds:
         return float(max(self._change[row], self._moved[row]))
 
     def changes(self, rows: Int64, light: LightVector) -> Float64:
-        """(k,) for some rows: how far each is from its light, by its bounces or by what the light has changed since its last relight.
+        """(k,) for the rows of all sectors that are there: how far each is from its light, by its bounces or by what the light has changed
+        since its last relight.
 
         Rows whose light has changed at all are no longer exact.
         """
         if light is not self._light:
             self._light = light
             if self._numbers is not None:
-                self._moved = relative_changes(self._numbers, self._scale, light)
-                self.exact[self._moved > 0] = False
+                self._moved[rows] = relative_changes(self._numbers[rows], self._scale[rows], light)
+                self.exact[rows[self._moved[rows] > 0]] = False
         return np.maximum(self._change[rows], self._moved[rows] * self._share[rows])

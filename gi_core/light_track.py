@@ -24,6 +24,8 @@ SHORTEST_STEP_S = 20.0
 STEP_REAL_S = 0.5
 # Blends within a step: a third of a second of a clock that runs at 1 x, in which the sky changes by less than any eye or file sees.
 BLENDS_PER_STEP = 64
+# Of this moment, and of one that somebody looks ahead to.
+KEPT_BLENDS = 8
 _EPOCH = datetime(2000, 1, 1, tzinfo=UTC)
 
 WeatherAt = Callable[[datetime], Weather]
@@ -41,13 +43,15 @@ class LightTrack:
         self._step_s = SHORTEST_STEP_S
         self._made: dict[int, Future[Lighting]] = {}
         self._standing: tuple[datetime, Lighting] | None = None
-        self._blended: tuple[tuple[int, int], Lighting] | None = None
+        self._blended: dict[tuple[int, int], Lighting] = {}
+        """By step and part of it: of the moments that were asked for last."""
 
     def set_weather(self, weather_at: WeatherAt) -> None:
         """The weather from now on, a function of the moment; the next ``at`` shows it."""
         self._weather_at = weather_at
         self._made.clear()
-        self._standing = self._blended = None
+        self._blended.clear()
+        self._standing = None
 
     def at(self, moment: datetime, rate: float) -> Lighting:
         """The light at an aware moment while the clock runs at ``rate`` x real time (0: it stands).
@@ -66,19 +70,31 @@ class LightTrack:
         if step_s != self._step_s:
             self._step_s = step_s
             self._made.clear()
-            self._blended = None
+            self._blended.clear()
         steps = (moment - _EPOCH).total_seconds() / step_s
         here = math.floor(steps)
-        for number in (here, here + 1, here + 2):
-            if number not in self._made:
-                self._made[number] = self._worker.submit(self._make, number, step_s, self._weather_at)
-        for number in [n for n in self._made if not here <= n <= here + 2]:
+        self._have_made(here, here + 1)
+        # The one before stays for who looks ahead over its end, and then asks for now.
+        for number in [n for n in self._made if not here - 1 <= n <= here + 2]:
             del self._made[number]
         part = math.floor((steps - here) * BLENDS_PER_STEP)
-        if self._blended is None or self._blended[0] != (here, part):
+        found = self._blended.get((here, part))
+        if found is None:
             first, second = self._made[here].result(), self._made[here + 1].result()
-            self._blended = (here, part), between_lightings(first, second, part / BLENDS_PER_STEP, moment.isoformat())
-        return self._blended[1]
+            begin = _EPOCH + timedelta(seconds=(here + part / BLENDS_PER_STEP) * step_s)
+            time = begin.astimezone(moment.tzinfo).isoformat()
+            found = self._blended[here, part] = between_lightings(first, second, part / BLENDS_PER_STEP, time)
+            while len(self._blended) > KEPT_BLENDS:
+                del self._blended[next(iter(self._blended))]
+        # Last, so that the worker does not take Python's lock from who asks.
+        self._have_made(here + 2)
+        return found
+
+    def _have_made(self, *numbers: int) -> None:
+        assert self._weather_at is not None
+        for number in numbers:
+            if number not in self._made:
+                self._made[number] = self._worker.submit(self._make, number, self._step_s, self._weather_at)
 
     def _make(self, number: int, step_s: float, weather_at: WeatherAt) -> Lighting:
         moment = _EPOCH + timedelta(seconds=number * step_s)

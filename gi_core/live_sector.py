@@ -202,14 +202,13 @@ class LiveSector:
         for _ in range(times):
             give_way()
             relighter.relight([self.resident], light.given, AHEAD_PASSES)
-            self.moved_ahead = self.measure()
+            self.moved_ahead = self.measure(self.resident.read_cubes())
             if self.moved_ahead <= SETTLED_CHANGE:
                 break
         self.lit_ahead = light
 
-    def measure(self) -> float:
-        """Read what a relight gave: how far it moved the probes' light, as a share of the brightest."""
-        after = self.resident.read_cubes()
+    def measure(self, after: Float32) -> float:
+        """Take note of the cubes (P, B, 3) [lx] that a relight gave: how far it moved the probes' light, as a share of the brightest."""
         peak = float(after.max(initial=0.0))
         moved = float(np.abs(after - self._cubes).max(initial=0.0))
         if self._starts_fade:

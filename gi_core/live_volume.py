@@ -5,8 +5,9 @@ leaves in sight stays where it is, and only columns that come into sight are fil
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
+from typing import Any
 
 import numpy as np
 import pyopencl as cl
@@ -78,6 +79,8 @@ class LiveVolume:
         self._arrays = arrays or volume_arrays(basis)
         self._buffer = device.allocate(4 * 3 * BASIS_SIZES[basis] * int(np.prod(VOLUME_SHAPE)))
         self._filled_at = -1
+        self._torus: tuple[Any, cl.Event] | None = None
+        """The filled buffer, once the event says so: from ``enqueue`` to ``publish``."""
 
     @property
     def nbytes(self) -> int:
@@ -102,9 +105,13 @@ class LiveVolume:
             parts = (box,) if sector.shown_at > self._filled_at else new_parts if is_new else ()
             cubes = shown(sector) if parts else None
             for part in parts:
-                record = box_record(part, sector.resident.sector)
-                record["volume_first"][0, [0, 2]] = part.lattice_first[[0, 2]] % (VOLUME_SHAPE[2], VOLUME_SHAPE[1])
-                sector.resident.fill_volume(record, tuple(part.size.tolist()), self._buffer, cubes, self.basis)
+                x, _, z = part.lattice_first
+                on_torus = replace(part, volume_first=(x % VOLUME_SHAPE[2], part.volume_first[1], z % VOLUME_SHAPE[1]))
+                record = box_record(on_torus, sector.resident.sector)
+                sector.resident.fill_volume(record, part.size, self._buffer, cubes, self.basis)
+        # Mapped: on a processor that is the device's own memory. Reading rectangles takes twice as long.
+        shape = (BASIS_SIZES[self.basis], *VOLUME_SHAPE, 3)
+        self._torus = cl.enqueue_map_buffer(self._device.queue, self._buffer, cl.map_flags.READ, 0, shape, np.float32, is_blocking=False)
 
     def publish(self, tick: int, placeholder: Callable[[SectorIndex], Float32]) -> PublishedVolume:
         """Read what ``enqueue`` asked for, put placeholders in, and show it."""
@@ -126,10 +133,11 @@ class LiveVolume:
     def _read(self, values: Float32) -> None:
         """Roll the torus out: up to four blocks, whose columns lie beside one another."""
         assert self._layout is not None
+        assert self._torus is not None
+        (torus, filled), self._torus = self._torus, None
         first_x, _, first_z = self._layout.first.tolist()
         lines, columns = _runs(first_z, VOLUME_SHAPE[1]), _runs(first_x, VOLUME_SHAPE[2])
-        # Mapped: on a processor that is the device's own memory. Reading rectangles takes twice as long.
-        torus, _ = cl.enqueue_map_buffer(self._device.queue, self._buffer, cl.map_flags.READ, 0, values.shape, np.float32)
+        filled.wait()
         with torus.base:
             for (z, from_z), (x, from_x) in product(lines, columns):
                 values[:, :, z, x] = torus[:, :, from_z, from_x]
@@ -137,21 +145,23 @@ class LiveVolume:
 
 def came_into_sight(box: SectorBox, first: Int64, before: Int64) -> list[SectorBox]:
     """The parts of a box that a volume at ``first`` (3,) [lattice] shows and one at ``before`` did not; along y it is all or nothing."""
-    here, there, low, size = first.tolist(), before.tolist(), box.lattice_first.tolist(), box.size.tolist()
+    here, there, low = first.tolist(), before.tolist(), list(box.lattice_first)
     if here == there:
         return []
     if here[1] != there[1]:
         return [box]
-    high = [at + count for at, count in zip(low, size, strict=True)]
+    high = [at + count for at, count in zip(low, box.size, strict=True)]
     parts = []
     for axis, count in ((0, VOLUME_SHAPE[2]), (2, VOLUME_SHAPE[1])):
         # What lies on one side of where the volume was, then on the other; the other axis cuts what is left.
         seen = max(low[axis], there[axis]), min(high[axis], there[axis] + count)
         for start, stop in ((low[axis], min(high[axis], there[axis])), (max(low[axis], there[axis] + count), high[axis])):
             if start < stop:
-                corner, extent = low.copy(), [b - a for a, b in zip(low, high, strict=True)]
-                corner[axis], extent[axis] = start, stop - start
-                parts.append(SectorBox(box.index, np.array(corner) - first, np.array(corner), np.array(extent)))
+                corner, end = low.copy(), high.copy()
+                corner[axis], end[axis] = start, stop
+                (x, y, z), (x1, y1, z1) = corner, end
+                at = x - here[0], y - here[1], z - here[2]
+                parts.append(SectorBox(box.index, at, (x, y, z), (x1 - x, y1 - y, z1 - z)))
         low[axis], high[axis] = seen
         if low[axis] >= high[axis]:
             break

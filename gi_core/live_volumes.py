@@ -83,9 +83,15 @@ class LiveVolumes:
                 self._fall_behind(name, tick, _away_m(index, *places[name]))
 
     def fill(
-        self, tick: int, until_s: float, shown: ShownCubes, placeholder: Callable[[SectorIndex], Float32]
+        self,
+        tick: int,
+        until_s: float,
+        shown: ShownCubes,
+        placeholder: Callable[[SectorIndex], Float32],
+        meanwhile: Callable[[], None] = lambda: None,
     ) -> tuple[tuple[str, ...], int]:
-        """Fill and publish volumes in the order of ``fill_plan``, at least one, until ``time.perf_counter`` says ``until_s``.
+        """Fill and publish volumes in the order of ``fill_plan``, at least one, until ``time.perf_counter`` says ``until_s``. While the
+        device fills one, the one before is published, and while it fills the last there is time for what is to be done ``meanwhile``.
 
         -> whose, and how many wait for another tick
         """
@@ -93,17 +99,27 @@ class LiveVolumes:
         behind = [self._behind[name] for name in ready]
         order = fill_order(tick, np.array([b.since for b in behind], np.int64), np.array([b.away_m for b in behind], np.float64))
         filled: list[str] = []
-        for row in order.tolist():
-            if filled and time.perf_counter() >= until_s:
-                break
-            name = ready[row]
+
+        def publish(name: str) -> None:
             volume = self.of_player[name]
-            volume.enqueue(self._residents, shown)
             if volume.published is None:
                 self.looked_at.update(volume.touched)
             volume.publish(tick, placeholder)
             del self._behind[name]
             filled.append(name)
+
+        under_way: str | None = None
+        for row in order.tolist():
+            if under_way is not None and time.perf_counter() >= until_s:
+                break
+            name = ready[row]
+            self.of_player[name].enqueue(self._residents, shown)
+            if under_way is not None:
+                publish(under_way)
+            under_way = name
+        meanwhile()
+        if under_way is not None:
+            publish(under_way)
         return tuple(filled), len(ready) - len(filled)
 
     def _fall_behind(self, name: str, tick: int, away_m: float) -> None:

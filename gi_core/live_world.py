@@ -5,8 +5,9 @@ A tick, in order:
     relight      take over sectors that loaders have put on the device and lit, and relight those that tick_plan chooses; in an idle world
                  one that has not settled exactly
     volumes      of players who moved, or near whom something was relit, until the tick's time for it is spent; the rest wait
+    stream       while the device fills the last: plan loads and evictions for where players are and go; after a long tick the next does,
+                 for a while
     shadow map   draw some more of the next one; sectors take samples of one that was just drawn
-    stream       plan loads and evictions for where players are and go; after a long tick the next does, for a while
 
 Lighting belongs to the world: players share lit sectors, only volumes are theirs. One thread calls ``tick``; what it publishes is
 anybody's. No file is read and no kernel compiled in it, once ``warm_up`` has run.
@@ -17,6 +18,7 @@ import time
 from collections.abc import Collection, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import product
 
 import numpy as np
@@ -160,7 +162,7 @@ class LiveWorld:
         report = TickReport(tick)
 
         def lap(name: str) -> None:
-            report.ms[name] = (time.perf_counter() - started) * 1e3 - sum(report.ms.values())
+            report.ms[name] = report.ms.get(name, 0.0) + (time.perf_counter() - started) * 1e3 - sum(report.ms.values())
 
         report.loaded = tuple(self.streamer.take_over())
         for index in report.loaded:
@@ -174,23 +176,18 @@ class LiveWorld:
         report.missing = self.volumes.missing
         changed = self._advance(tick, gains_changed, report)
         self.volumes.note(tick, players.ids, players.positions, changed)
+
+        def meanwhile() -> None:
+            lap("volumes")
+            report.evicted = self._stream(players, started)
+            lap("stream")
+
         until_s = started + fill_ms / 1e3
-        report.filled, report.waiting = self.volumes.fill(tick, until_s, lambda sector: self._shown(sector, light), self._placeholder)
+        shown = partial(self._shown, light=light)
+        report.filled, report.waiting = self.volumes.fill(tick, until_s, shown, self._placeholder, meanwhile)
         lap("volumes")
-        if self._shadows is not None:
-            sampled = self._shadows.step(players.positions, players.velocities, light, boxes, self.streamer.residents)
-            for index in sampled:
-                other = index in self.streamer.residents and self.streamer.residents[index].has_other_source
-                self._needs.disturb(self._row[index], WHOLLY if other else BURST_CHANGE)
+        self._step_shadows(players, light, boxes)
         lap("shadow_map")
-        is_long = (time.perf_counter() - started) * 1e3 > LONG_TICK_MS
-        if is_long and self._put_off < MOST_PUT_OFF and not self.streamer.is_overfull:
-            self._put_off += 1
-        else:
-            self._put_off = 0
-            self.plan = self.streamer.step(players.positions, players.velocities)
-            report.evicted = self._evicted = self.plan.evictions
-        lap("stream")
         return report
 
     def undisturbed(self) -> AbstractContextManager[None]:
@@ -277,11 +274,10 @@ class LiveWorld:
         for sector, is_read in zip(sectors, read, strict=True):
             sector.light(light, is_read)
         passes = [BURST_PASSES if is_read and needs.at_most(rows[k]) > BURST_CHANGE else 1 for k, is_read in zip(chosen, read, strict=True)]
-        if sectors:
-            self._relighter.relight([sector.resident for sector in sectors], light.given, passes)
+        relit = self._relighter.begin([sector.resident for sector in sectors], light.given, passes)
         report.passes = sum(passes)
-        for k, sector in zip(chosen, sectors, strict=True):
-            needs.relit(int(rows[k]), tick, light.vector, sector.measure())
+        for k, sector, cubes in zip(chosen, sectors, relit, strict=True):
+            needs.relit(int(rows[k]), tick, light.vector, sector.measure(cubes()))
         report.relit = indices
         if not chosen and light.standing:
             # An idle world has time to make what it shows the very bytes of a query: nearest first, one a tick.
@@ -295,6 +291,25 @@ class LiveWorld:
         for index in (*report.relit, *report.settled):
             if residents[index].lamps.nbytes:  # dozens of lamps cast more shadows than there was room for
                 self.streamer.count_again(index, lamps=False)
+
+    def _step_shadows(self, players: TickPlayers, light: LiveLight, boxes: Sequence[MovingBox]) -> None:
+        if self._shadows is None:
+            return
+        residents = self.streamer.residents
+        for index in self._shadows.step(players.positions, players.velocities, light, boxes, residents):
+            other = index in residents and residents[index].has_other_source
+            self._needs.disturb(self._row[index], WHOLLY if other else BURST_CHANGE)
+
+    def _stream(self, players: TickPlayers, started: float) -> tuple[SectorIndex, ...]:
+        """Plan, unless the tick that ``started`` has been long; evicted sectors."""
+        is_long = (time.perf_counter() - started) * 1e3 > LONG_TICK_MS
+        if is_long and self._put_off < MOST_PUT_OFF and not self.streamer.is_overfull:
+            self._put_off += 1
+            return ()
+        self._put_off = 0
+        self.plan = self.streamer.step(players.positions, players.velocities)
+        self._evicted = self.plan.evictions
+        return self._evicted
 
     def _advance(self, tick: int, gains_changed: bool, report: TickReport) -> list[SectorIndex]:
         """Sectors that show something else from this tick on, or are gone."""

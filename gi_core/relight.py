@@ -1,14 +1,15 @@
 """The relighter: passes over resident sectors, a few each tick or until nothing moves any more (slide "Relighting")."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import pyopencl as cl
 
 from gi_core.arrays import Float32
 from gi_core.basis import FEEDBACK, basis_of_size
-from gi_core.device import Device
+from gi_core.device import LANES, Device
 from gi_core.grid import SectorIndex
 from gi_core.relight_input import RelightInput
 from gi_core.resident_sector import LightOnDevice, ResidentSector
@@ -53,6 +54,20 @@ class Relighter:
 
         One sector's are on their way when this returns. Several go on side by side, and all but the first's are done.
         """
+        for lane in self._begin(residents, given, passes)[1:LANES]:
+            lane.finish()
+
+    def begin(self, residents: Sequence[ResidentSector], given: RelightInput, passes: Sequence[int]) -> list[Callable[[], Float32]]:
+        """As ``relight``, but all are on their way when this returns, and the cubes that they make as well: one function for each sector,
+        to be called before anything else is done with it, which waits for them and gives them (P, B, 3) [lx]."""
+        lanes = self._begin(residents, given, passes)
+        reading = [resident.begin_reading(lane) for resident, lane in zip(residents, lanes, strict=True)]
+        for lane in lanes[:LANES]:
+            lane.flush()
+        return reading
+
+    def _begin(self, residents: Sequence[ResidentSector], given: RelightInput, passes: int | Sequence[int]) -> list[cl.CommandQueue]:
+        """-> each sector's queue, the first being the device's own"""
         if self._light is None or self._light.given is not given:
             self._light = LightOnDevice(self.device, given)
         for resident in residents:
@@ -66,8 +81,7 @@ class Relighter:
             resident.enqueue(lanes[place % len(lanes)], count)
         for lane in lanes:
             lane.flush()
-        for lane in lanes[1:]:
-            lane.finish()
+        return [lanes[place % len(lanes)] for place in range(len(residents))]
 
     def converge(self, resident: ResidentSector, given: RelightInput, residual: float = QUERY_RESIDUAL) -> Converged:
         """Relight a sector from darkness until what later bounces could still add is below ``residual`` times the peak.

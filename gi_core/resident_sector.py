@@ -10,6 +10,7 @@ What changes seldom is worked out when it changes, and a pass only does what eve
 On a processor the last two lines are one kernel, relight_sector.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -215,9 +216,19 @@ class ResidentSector:
 
     def read_cubes(self) -> Float32:
         """The probes' cubes (P, B, 3) float32 [lx], after all that was enqueued."""
-        cubes = np.zeros((self.sector.probe_count, self.sector.basis_size, 4), np.float32)
-        self.device.read(self.cubes, cubes)
-        return np.ascontiguousarray(cubes[..., :3])
+        return self.begin_reading(self.device.queue)()
+
+    def begin_reading(self, queue: cl.CommandQueue) -> Callable[[], Float32]:
+        """Enqueue a copy of the cubes behind what else is in a queue; what this returns waits for it and gives them."""
+        cubes = np.empty((self.sector.probe_count, self.sector.basis_size, 4), np.float32)
+        copied = cl.enqueue_copy(queue, cubes, self.cubes, is_blocking=False) if cubes.size else None
+
+        def finish() -> Float32:
+            if copied is not None:
+                copied.wait()
+            return np.ascontiguousarray(cubes[..., :3])
+
+        return finish
 
     def write_cubes(self, cubes: Float32) -> None:
         """Set the probes' cubes (P, B, 3) float32 [lx]: where the next pass takes its feedback from."""

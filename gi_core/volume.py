@@ -59,28 +59,32 @@ class Volume:
         return np.asarray(self.mask == (VOXEL_INDOORS if self.rooms else VOXEL_OUTDOORS), np.bool_)
 
 
-@dataclass(frozen=True, eq=False)
+Voxels = tuple[int, int, int]  # along x, y, z
+
+
+@dataclass(frozen=True, slots=True)
 class SectorBox:
-    """The part of a volume that one sector fills: first indices and size along (x, y, z), y being the whole height."""
+    """The part of a volume that one sector fills: first indices and size along (x, y, z), y being the whole height.
+
+    Numbers of Python's: dozens of boxes are made in a tick, and small arrays take longer than what they are for.
+    """
 
     index: SectorIndex
-    volume_first: Int64
-    lattice_first: Int64
-    size: Int64
+    volume_first: Voxels
+    lattice_first: Voxels
+    size: Voxels
 
 
 def plan_boxes(first_voxel: Int64, voxel_size_m: float = VOXEL_SIZE_M) -> list[SectorBox]:
     """Which sectors a volume reads, and where each goes. Pure; together they cover the volume once."""
     ny, nz, nx = VOLUME_SHAPE
-    columns = [split_columns(int(first_voxel[0]), nx, voxel_size_m), split_columns(int(first_voxel[2]), nz, voxel_size_m)]
-    boxes = []
-    for sector_z, z0, z1 in columns[1]:
-        for sector_x, x0, x1 in columns[0]:
-            lattice = np.array([x0, first_voxel[1], z0], np.int64)
-            boxes.append(
-                SectorBox(SectorIndex(sector_x, sector_z), lattice - first_voxel, lattice, np.array([x1 - x0, ny, z1 - z0], np.int64))
-            )
-    return boxes
+    x, y, z = first_voxel.tolist()
+    columns, lines = split_columns(x, nx, voxel_size_m), split_columns(z, nz, voxel_size_m)
+    return [
+        SectorBox(SectorIndex(sector_x, sector_z), (x0 - x, 0, z0 - z), (x0, y, z0), (x1 - x0, ny, z1 - z0))
+        for sector_z, z0, z1 in lines
+        for sector_x, x0, x1 in columns
+    ]
 
 
 def split_columns(first: int, count: int, voxel_size_m: float) -> list[tuple[int, int, int]]:
@@ -104,13 +108,14 @@ def lattice_record(box: SectorBox, first: Int32, shape: tuple[int, ...]) -> AnyA
     """The box as fill_volume.cl reads it from voxels (y, z, x) that begin at a lattice index (3,)."""
     ny, nz, nx = VOLUME_SHAPE
     sy, sz, sx = shape
-    record = np.zeros(1, VOLUME_BOX.dtype)
-    record["box_size"][0, :3] = box.size
-    record["volume_first"][0, :3] = box.volume_first
-    record["volume_size"][0, :3] = (nx, ny, nz)
-    record["sector_first"][0, :3] = box.lattice_first - first
-    record["sector_size"][0, :3] = (sx, sy, sz)
-    return record
+    box_size, volume_first, volume_size = (*box.size, 0), (*box.volume_first, 0), (nx, ny, nz, 0)
+    sector_first, sector_size = (*_counted_from(box.lattice_first, first), 0), (sx, sy, sz, 0)
+    return np.array([(box_size, volume_first, volume_size, sector_first, sector_size)], VOLUME_BOX.dtype)
+
+
+def _counted_from(lattice: Voxels, first: AnyArray) -> Voxels:
+    (x, y, z), (first_x, first_y, first_z) = lattice, first.tolist()
+    return x - first_x, y - first_y, z - first_z
 
 
 def sector_slices(box: SectorBox, sector: Sector) -> tuple[AnyArray, slice, slice]:
@@ -121,14 +126,15 @@ def sector_slices(box: SectorBox, sector: Sector) -> tuple[AnyArray, slice, slic
 
 def _columns(box: SectorBox, sector: Sector) -> tuple[slice, slice]:
     """The columns (z, x) of a sector's voxel arrays that a box reads."""
-    (x, _, z), (nx, _, nz) = (box.lattice_first - sector.voxel_first).tolist(), box.size.tolist()
+    (x, _, z), (nx, _, nz) = _counted_from(box.lattice_first, sector.voxel_first), box.size
     return slice(z, z + nz), slice(x, x + nx)
 
 
 def box_mask(box: SectorBox, sector: Sector) -> UInt8:
     """Voxel classes (y, z, x) of a box. Below what a sector stores is solid."""
-    mask: UInt8 = np.empty(box.size[[1, 2, 0]], np.uint8)
-    first, layers, height = int(box.lattice_first[1] - sector.voxel_first[1]), len(sector.voxel_class), int(box.size[1])
+    nx, height, nz = box.size
+    mask: UInt8 = np.empty((height, nz, nx), np.uint8)
+    first, layers = box.lattice_first[1] - int(sector.voxel_first[1]), len(sector.voxel_class)
     z, x = _columns(box, sector)
     # Layers that are stored, what lies below them, and above them the highest again.
     low, high = min(max(-first, 0), height), min(max(layers - first, 0), height)
@@ -148,7 +154,7 @@ def box_rooms(box: SectorBox, sector: Sector, voxel_room: UInt16) -> UInt16:
 
 def box_slices(box: SectorBox) -> tuple[slice, slice, slice]:
     """Where a box lies in its volume's (y, z, x)."""
-    (x, y, z), (nx, ny, nz) = box.volume_first.tolist(), box.size.tolist()
+    (x, y, z), (nx, ny, nz) = box.volume_first, box.size
     return slice(y, y + ny), slice(z, z + nz), slice(x, x + nx)
 
 

@@ -52,6 +52,6 @@ class ResidentGrid:
     def fill(self, box: SectorBox, target: cl.Buffer, cubes: cl.Buffer, basis: str) -> None:
         """Enqueue this sector's part of a volume from its probes' light, in a basis."""
         kernel = self._device.shared_kernel("fill_volume", BASIS_SIZE=BASIS_SIZES[basis], VOXEL_PROBES=self._probes)
-        whole = tuple(-(-int(count) // group) * group for count, group in zip(box.size, VOXEL_GROUP, strict=True))
+        whole = tuple(-(-count // group) * group for count, group in zip(box.size, VOXEL_GROUP, strict=True))
         record = lattice_record(box, self.first, self.kind.shape)
         kernel.launch(whole, VOXEL_GROUP, record, self._probe, self._weight, cubes, target)

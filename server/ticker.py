@@ -11,6 +11,7 @@ import logging
 import queue
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import suppress
@@ -20,7 +21,7 @@ import numpy as np
 
 from gi_core.errors import UnknownTimeError
 from gi_core.light_blend import LightVector
-from gi_core.light_track import LightTrack
+from gi_core.light_track import KEPT_BLENDS, LightTrack
 from gi_core.lighting import Lighting
 from gi_core.lights import lamps_on
 from gi_core.live_sector import LiveLight
@@ -37,6 +38,8 @@ log = logging.getLogger("sectorlight.ticker")
 # Of a tick's time; then volumes wait for the next. With 0.4 fifty players had three times as many late ticks and up to a sixth more frames,
 # with 0.2 half the frames.
 FILL_UNTIL = 0.3
+# How far short ticks look ahead: half as long as a clock that runs at 1 x keeps one light.
+LOOK_AHEAD_TICKS = 5
 
 Listener = Callable[[TickReport], None]
 
@@ -60,9 +63,8 @@ class Ticker:
         self._track = LightTrack(world.dataset.world.location, self._worker, sky)
         self._track.set_weather(state.weather.at)
         self._lighting: Lighting | None = None
-        self._light: LiveLight | None = None
-        """The latest that was made, of this tick or of the next, and what it was made of."""
-        self._light_of: tuple[object, ...] = ()
+        self._lights: deque[tuple[tuple[object, ...], LiveLight]] = deque(maxlen=KEPT_BLENDS)
+        """Those that were made last, of this tick or a later one, each behind what it was made of."""
         self._lit_lamps: tuple[object, ...] = ()
         self._lamps_now: tuple[tuple[Lamp, ...], tuple[Lamp, ...]] = ((), ())
         self._thread = threading.Thread(target=self._run, name="ticker", daemon=True)
@@ -172,7 +174,7 @@ class Ticker:
             self.failure = str(error)
             return
         self.failure = None
-        self._look_ahead(number + 1, begun)
+        self._look_ahead(number + LOOK_AHEAD_TICKS, begun)
         took_ms = (time.perf_counter() - begun) * 1e3
         self.stats.add(report, took_ms, max(begun - due, 0.0) * 1e3, period_s * 1e3)
         for listener in tuple(self.listeners):
@@ -220,16 +222,18 @@ class Ticker:
             if self._lighting is None:
                 raise
             lighting = self._lighting
+        self._lighting = lighting
         state = self.state
         key = (lighting, state.settings, state.lamps)
-        if self._light is None or any(a is not b for a, b in zip(key, self._light_of, strict=True)):
-            self._lighting = lighting
-            self._light = self._make_light(lighting, state)
-            self._light_of = key
-        return self._light
+        for made_of, light in self._lights:
+            if all(a is b for a, b in zip(key, made_of, strict=True)):
+                return light
+        light = self._make_light(lighting, state)
+        self._lights.append((key, light))
+        return light
 
     def _look_ahead(self, number: int, begun: float) -> None:
-        """Make the next tick's light in one that has been short: where it changes, sectors are relit and volumes filled for it as well."""
+        """Make a later tick's light in one that has been short: where it changes, sectors are relit and volumes filled as well."""
         last = self.state.clock.last_tick
         if (time.perf_counter() - begun) * 1e3 < LONG_TICK_MS and (last is None or number <= last):
             with suppress(Exception):  # the tick that it is for says so, if it still cannot be made

@@ -181,7 +181,7 @@ def test_a_sector_of_any_size_is_lit_shown_and_dark_again(make_sector, engine, s
         for _ in range(FADE_TICKS):
             live.light(light, is_read=True)
             relighter.relight([live.resident], light.given, 3)
-            assert 0 <= live.measure() < np.inf
+            assert 0 <= live.measure(live.resident.read_cubes()) < np.inf
             live.advance(next(number), must_show=True, is_read=True)
         assert live.settle(relighter, light, is_read=True)
         live.advance(next(number), must_show=True, is_read=True)

@@ -20,7 +20,7 @@ def test_boxes_cover_the_volume_once_with_the_right_sectors(x, y, z):
     for box in plan_boxes(first):
         (bx, by, bz), (nx, ny, nz) = box.volume_first, box.size
         covered[by : by + ny, bz : bz + nz, bx : bx + nx] += 1
-        for corner in (box.lattice_first, box.lattice_first + box.size - 1):
+        for corner in (box.lattice_first, np.add(box.lattice_first, box.size) - 1):
             assert sector_of(voxel_centre(corner)) == box.index
     assert (covered == 1).all()
 

@@ -231,7 +231,7 @@ def test_a_volume_equals_the_twins_blend(device, make_sector, basis):
     resident.write_cubes(cubes)
     box = next(b for b in plan_boxes(np.array([0, -1, 0])) if b.index == sector.index)
     target = device.allocate(basis * 16 * 32 * 32 * 3 * 4)
-    resident.fill_volume(box_record(box, sector), tuple(int(n) for n in box.size), target)
+    resident.fill_volume(box_record(box, sector), box.size, target)
     values = np.zeros((basis, 16, 32, 32, 3), np.float32)
     device.read(target, values)
     probe, weight = outdoor_blend(sector)

@@ -107,7 +107,7 @@ def test_with_all_gains_and_colours_at_their_maximum_ticks_never_grow(make_secto
     for tick in range(ticks):
         live.light(light, is_read=True)
         relighter.relight([live.resident], light.given)
-        live.measure()
+        live.measure(live.resident.read_cubes())
         live.advance(tick, must_show=True, is_read=True)
         device.read(live.shown(panel, lambda: np.full((6, 3), MAX_AMBIENT_LX, np.float32), "cube"), shown)
         if tick == 1_000:  # 0.95 ** 1000 is 5e-23: all that bounces will ever add is there

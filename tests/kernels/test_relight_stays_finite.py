@@ -71,7 +71,7 @@ def test_relights_are_finite(resident, light, held, lamps, passes):
     for basis in served_from(basis_of_size(sector.basis_size)):
         values = np.zeros((BASIS_SIZES[basis], 16, 32, 32, 3), np.float32)
         target = device.allocate(values.nbytes)
-        resident.fill_volume(box_record(box, sector), tuple(int(n) for n in box.size), target, resident.converted(basis), basis)
+        resident.fill_volume(box_record(box, sector), box.size, target, resident.converted(basis), basis)
         device.read(target, values)
         assert np.isfinite(values).all()
 
