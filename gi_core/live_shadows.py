@@ -37,8 +37,8 @@ log = logging.getLogger("sectorlight.shadows")
 TRIANGLES_PER_TICK = 1000
 SECTORS_SAMPLED_PER_TICK = 2
 PLAYERS_PER_SHARE, MOST_SHARES = 10, 6
-# Where many walk, the next tick looks at others.
-PLAYERS_LOOKED_AT_PER_TICK = 4
+# Where many walk, the next tick looks at others; few are looked at every so many ticks, in which nobody gets far.
+PLAYERS_LOOKED_AT_PER_TICK, LOOK_TICKS = 4, 4
 # Sectors with ground this near to a map's middle, along x and z, lie whole in it; the middle is rounded to texels.
 NEAR_M = HALF_MAP_M - SECTOR_SIZE_M - 1.0
 # Maps are drawn around where players will be in so long [s], but not farther ahead than this [m]: the map then still covers what their
@@ -70,7 +70,8 @@ class LiveShadows:
         """What the planner has read, its own."""
         self._planning: Future[tuple[ShadowPlan | None, Casters]] | None = None
         self._to_draw: Casters = {}
-        self._turn = 0
+        self._turn = self._ticks = 0
+        """Which player is looked at next, and how many ticks there have been."""
         self._to_sample: list[SectorIndex] = []
         self._dark = True
         self._boxes: tuple[Sequence[MovingBox], Float64] = (), NO_BOXES
@@ -91,6 +92,7 @@ class LiveShadows:
     ) -> tuple[SectorIndex, ...]:
         """One tick's share of planning, drawing and sampling, for players at positions (p, 3) [m] with velocities (p, 3) [m/s]; sectors
         whose sun that changes."""
+        self._ticks += 1
         if not light.sun_is_up:
             if self._dark:
                 return ()
@@ -121,7 +123,7 @@ class LiveShadows:
                 if plan is not None and is_near(plan.to_sun, light.to_sun):
                     self._to_draw = casters
                     self._map.begin(plan)
-        elif len(positions):
+        elif len(positions) > PLAYERS_LOOKED_AT_PER_TICK or (len(positions) and self._ticks % LOOK_TICKS == 0):
             if boxes is not self._boxes[0]:
                 self._boxes = boxes, box_corners(boxes)
             self._plan(positions + np.clip(LEAD_S * velocities, -MOST_LEAD_M, MOST_LEAD_M), light.to_sun, self._boxes[1], residents)

@@ -45,6 +45,8 @@ class LiveVolumes:
         self._firsts: dict[str, bytes] = {}
         self._readers: dict[SectorIndex, set[str]] = {}
         self._behind: dict[str, _Behind] = {}
+        self._places: dict[str, list[float]] = {}
+        """Where players stood at the last ``follow``, x and z [m]."""
 
     @property
     def nbytes(self) -> int:
@@ -56,8 +58,8 @@ class LiveVolumes:
         """Sectors that published volumes read and that are not there."""
         return tuple(index for index in self.looked_at if index not in self._residents)
 
-    def note(self, tick: int, ids: Sequence[str], positions: Float64, changed: Sequence[SectorIndex]) -> None:
-        """Find what has to be filled: for players ``ids`` (p) at positions (p, 3) [m], and sectors that show something else now."""
+    def follow(self, tick: int, ids: Sequence[str], positions: Float64) -> None:
+        """Have volumes stand where players are: ``ids`` (p) at positions (p, 3) [m]. Those who moved to other voxels have to be filled."""
         for gone in self.of_player.keys() - set(ids):
             self._unread(gone, self.of_player.pop(gone))
             self._behind.pop(gone, None)
@@ -77,21 +79,19 @@ class LiveVolumes:
                 if volume.published is not None:
                     self.looked_at.update(volume.touched)
                 self._fall_behind(name, tick, 0.0)
-        places = dict(zip(ids, positions[:, [0, 2]].tolist(), strict=True))
+        self._places = dict(zip(ids, positions[:, [0, 2]].tolist(), strict=True))
+
+    def note(self, tick: int, changed: Sequence[SectorIndex]) -> None:
+        """Sectors show something else from this tick on: who reads them has to be filled."""
         for index in changed:
             for name in self._readers.get(index, ()):
-                self._fall_behind(name, tick, _away_m(index, *places[name]))
+                self._fall_behind(name, tick, _away_m(index, *self._places[name]))
 
     def fill(
-        self,
-        tick: int,
-        until_s: float,
-        shown: ShownCubes,
-        placeholder: Callable[[SectorIndex], Float32],
-        meanwhile: Callable[[], None] = lambda: None,
+        self, tick: int, until_s: float, shown: ShownCubes, placeholder: Callable[[SectorIndex], Float32]
     ) -> tuple[tuple[str, ...], int]:
         """Fill and publish volumes in the order of ``fill_plan``, at least one, until ``time.perf_counter`` says ``until_s``. While the
-        device fills one, the one before is published, and while it fills the last there is time for what is to be done ``meanwhile``.
+        device fills one, the one before is published.
 
         -> whose, and how many wait for another tick
         """
@@ -117,7 +117,6 @@ class LiveVolumes:
             if under_way is not None:
                 publish(under_way)
             under_way = name
-        meanwhile()
         if under_way is not None:
             publish(under_way)
         return tuple(filled), len(ready) - len(filled)

@@ -4,9 +4,8 @@ A tick, in order:
 
     relight      take over sectors that loaders have put on the device and lit, and relight those that tick_plan chooses; in an idle world
                  one that has not settled exactly
+    stream       while the device is at it, plan loads and evictions for where players are and go, and have volumes follow players
     volumes      of players who moved, or near whom something was relit, until the tick's time for it is spent; the rest wait
-    stream       while the device fills the last: plan loads and evictions for where players are and go; after a long tick the next does,
-                 for a while
     shadow map   draw some more of the next one; sectors take samples of one that was just drawn
 
 Lighting belongs to the world: players share lit sectors, only volumes are theirs. One thread calls ``tick``; what it publishes is
@@ -15,7 +14,7 @@ anybody's. No file is read and no kernel compiled in it, once ``warm_up`` has ru
 
 import threading
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
@@ -52,8 +51,6 @@ from gi_core.volume import box_record, plan_boxes
 from gi_core.world import Lamp
 
 DEFAULT_BUDGET_BYTES = 512 << 20
-# A tick that has taken this long [ms] leaves planning to later ones, at most so often on end. Sectors are planned for seconds ahead.
-LONG_TICK_MS, MOST_PUT_OFF = 1.5, 3
 # While a volume gets within this [s] to a sector that is not there, those that are loaded leave most of their light to ticks.
 HURRY_S = 1.0
 
@@ -85,6 +82,10 @@ class TickReport:
     waiting: int = 0
     passes: int = 0
     ms: dict[str, float] = field(default_factory=dict)
+
+
+# A sector that the device relights: its row, and what waits for its cubes and gives them.
+_Relit = tuple[int, LiveSector, Callable[[], Float32]]
 
 
 class LiveWorld:
@@ -123,10 +124,6 @@ class LiveWorld:
         self.streamer = Streamer(sector_table(dataset.world), dataset.sector, self._place, options, self._right_of_way)
         self.streamer.lamps_planned = bool(dataset.world.lamps)
         self.volumes = LiveVolumes(self._device, frozenset(dataset.world.sectors), self.streamer.residents, basis)
-        self._evicted: tuple[SectorIndex, ...] = ()
-        """Since volumes were last told of changes."""
-        self._put_off = 0
-        """How many ticks ago the streaming plan was wanted."""
         self._needs = LightNeeds(len(self.streamer.table.sectors))
         self._row = {index: row for row, index in enumerate(self.streamer.table.sectors)}
         self._light: LiveLight | None = None
@@ -171,20 +168,22 @@ class LiveWorld:
         if light is not self._light:
             self._placeholders.clear()
         self._light = light
-        self._relight(tick, light, report)
-        lap("relight")
+        relit = self._begin_relight(tick, light, report)
         report.missing = self.volumes.missing
+        lap("relight")
+        # While the device is at it.
+        self.plan = self.streamer.step(players.positions, players.velocities)
+        report.evicted = self.plan.evictions
+        lap("stream")
+        self.volumes.follow(tick, players.ids, players.positions)
+        lap("volumes")
+        self._end_relight(relit, tick, light, report)
+        lap("relight")
         changed = self._advance(tick, gains_changed, report)
-        self.volumes.note(tick, players.ids, players.positions, changed)
-
-        def meanwhile() -> None:
-            lap("volumes")
-            report.evicted = self._stream(players, started)
-            lap("stream")
-
+        self.volumes.note(tick, changed)
         until_s = started + fill_ms / 1e3
         shown = partial(self._shown, light=light)
-        report.filled, report.waiting = self.volumes.fill(tick, until_s, shown, self._placeholder, meanwhile)
+        report.filled, report.waiting = self.volumes.fill(tick, until_s, shown, self._placeholder)
         lap("volumes")
         self._step_shadows(players, light, boxes)
         lap("shadow_map")
@@ -260,37 +259,43 @@ class LiveWorld:
         if sector.lamps.given != (light.static_lamps, light.dynamic_lamps):
             self._needs.disturb(row, WHOLLY)
 
-    def _relight(self, tick: int, light: LiveLight, report: TickReport) -> None:
+    def _begin_relight(self, tick: int, light: LiveLight, report: TickReport) -> list[_Relit]:
+        """Choose sectors and have the device relight them."""
         residents, needs, plan = self.streamer.residents, self._needs, self.plan
         if not residents or plan is None:
-            return
+            return []
         rows = self.streamer.resident_rows()
         changes = needs.changes(rows, light.vector)
-        away = plan.needs.away_m[rows]
-        chosen = plan_tick(tick, needs.relit_at[rows], changes, away, places=self._places)
-        indices = tuple(self.streamer.table.sectors[rows[k]] for k in chosen)
-        sectors = [residents[index] for index in indices]
-        read = [index in self.volumes.looked_at for index in indices]
-        for sector, is_read in zip(sectors, read, strict=True):
+        chosen = plan_tick(tick, needs.relit_at[rows], changes, plan.needs.away_m[rows], places=self._places)
+        report.relit = tuple(self.streamer.table.sectors[rows[k]] for k in chosen)
+        sectors = [residents[index] for index in report.relit]
+        read = [index in self.volumes.looked_at for index in report.relit]
+        for index, sector, is_read in zip(report.relit, sectors, read, strict=True):
             sector.light(light, is_read)
+            self._count_lamps(index, sector)
         passes = [BURST_PASSES if is_read and needs.at_most(rows[k]) > BURST_CHANGE else 1 for k, is_read in zip(chosen, read, strict=True)]
-        relit = self._relighter.begin([sector.resident for sector in sectors], light.given, passes)
+        cubes = self._relighter.begin([sector.resident for sector in sectors], light.given, passes)
         report.passes = sum(passes)
-        for k, sector, cubes in zip(chosen, sectors, relit, strict=True):
-            needs.relit(int(rows[k]), tick, light.vector, sector.measure(cubes()))
-        report.relit = indices
-        if not chosen and light.standing:
-            # An idle world has time to make what it shows the very bytes of a query: nearest first, one a tick.
-            inexact = np.flatnonzero(~needs.exact[rows])
-            if len(inexact):
-                row = int(rows[inexact[np.argmin(away[inexact])]])
-                index = self.streamer.table.sectors[row]
-                if residents[index].settle(self._relighter, light, index in self.volumes.looked_at):
-                    needs.relit(row, tick, light.vector, 0.0, exact=True)
-                    report.settled = (index,)
-        for index in (*report.relit, *report.settled):
-            if residents[index].lamps.nbytes:  # dozens of lamps cast more shadows than there was room for
-                self.streamer.count_again(index, lamps=False)
+        return [(int(rows[k]), sector, lit) for k, sector, lit in zip(chosen, sectors, cubes, strict=True)]
+
+    def _end_relight(self, relit: list[_Relit], tick: int, light: LiveLight, report: TickReport) -> None:
+        """Wait for them. An idle world settles one instead, nearest first: it has time to make what it shows the very bytes of a query."""
+        residents, needs = self.streamer.residents, self._needs
+        for row, sector, cubes in relit:
+            needs.relit(row, tick, light.vector, sector.measure(cubes()))
+        rows = self.streamer.resident_rows()
+        inexact = rows[~needs.exact[rows]] if light.standing and not relit else rows[:0]
+        if len(inexact) and self.plan is not None:
+            row = int(inexact[np.argmin(self.plan.needs.away_m[inexact])])
+            index = self.streamer.table.sectors[row]
+            if residents[index].settle(self._relighter, light, index in self.volumes.looked_at):
+                needs.relit(row, tick, light.vector, 0.0, exact=True)
+                report.settled = (index,)
+                self._count_lamps(index, residents[index])
+
+    def _count_lamps(self, index: SectorIndex, sector: LiveSector) -> None:
+        if sector.lamps.nbytes:  # dozens of lamps cast more shadows than there was room for
+            self.streamer.count_again(index, lamps=False)
 
     def _step_shadows(self, players: TickPlayers, light: LiveLight, boxes: Sequence[MovingBox]) -> None:
         if self._shadows is None:
@@ -300,21 +305,9 @@ class LiveWorld:
             other = index in residents and residents[index].has_other_source
             self._needs.disturb(self._row[index], WHOLLY if other else BURST_CHANGE)
 
-    def _stream(self, players: TickPlayers, started: float) -> tuple[SectorIndex, ...]:
-        """Plan, unless the tick that ``started`` has been long; evicted sectors."""
-        is_long = (time.perf_counter() - started) * 1e3 > LONG_TICK_MS
-        if is_long and self._put_off < MOST_PUT_OFF and not self.streamer.is_overfull:
-            self._put_off += 1
-            return ()
-        self._put_off = 0
-        self.plan = self.streamer.step(players.positions, players.velocities)
-        self._evicted = self.plan.evictions
-        return self._evicted
-
     def _advance(self, tick: int, gains_changed: bool, report: TickReport) -> list[SectorIndex]:
         """Sectors that show something else from this tick on, or are gone."""
-        residents, changed = self.streamer.residents, list(self._evicted)
-        self._evicted = ()
+        residents, changed = self.streamer.residents, list(report.evicted)
         # Others have shown what they show since they were looked at last.
         self._fading.update(report.loaded, report.relit, report.settled)
         for index in list(residents) if gains_changed else self._fading.intersection(residents):

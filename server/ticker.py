@@ -25,7 +25,7 @@ from gi_core.light_track import KEPT_BLENDS, LightTrack
 from gi_core.lighting import Lighting
 from gi_core.lights import lamps_on
 from gi_core.live_sector import LiveLight
-from gi_core.live_world import LONG_TICK_MS, LiveWorld, TickPlayers, TickReport
+from gi_core.live_world import LiveWorld, TickPlayers, TickReport
 from gi_core.relight_input import relight_input
 from gi_core.settings import Settings
 from gi_core.user_sky import UserSky
@@ -38,8 +38,8 @@ log = logging.getLogger("sectorlight.ticker")
 # Of a tick's time; then volumes wait for the next. With 0.4 fifty players had three times as many late ticks and up to a sixth more frames,
 # with 0.2 half the frames.
 FILL_UNTIL = 0.3
-# How far short ticks look ahead: half as long as a clock that runs at 1 x keeps one light.
-LOOK_AHEAD_TICKS = 5
+# Ticks shorter than this [ms] look so far ahead: half as long as a clock that runs at 1 x keeps one light.
+SHORT_TICK_MS, LOOK_AHEAD_TICKS = 1.5, 5
 
 Listener = Callable[[TickReport], None]
 
@@ -235,7 +235,7 @@ class Ticker:
     def _look_ahead(self, number: int, begun: float) -> None:
         """Make a later tick's light in one that has been short: where it changes, sectors are relit and volumes filled as well."""
         last = self.state.clock.last_tick
-        if (time.perf_counter() - begun) * 1e3 < LONG_TICK_MS and (last is None or number <= last):
+        if (time.perf_counter() - begun) * 1e3 < SHORT_TICK_MS and (last is None or number <= last):
             with suppress(Exception):  # the tick that it is for says so, if it still cannot be made
                 self._light_at(number)
 

@@ -36,7 +36,8 @@ def test_whose_own_sector_was_relit_is_served_first_and_nobody_is_forgotten(worl
     players, light = far_from_the_change(world, engine)
     order = []
     for tick in range(1000, 1000 + len(players.ids)):
-        world.volumes.note(tick, players.ids, players.positions, [SectorIndex(-1, 0)] if tick == 1000 else [])
+        world.volumes.follow(tick, players.ids, players.positions)
+        world.volumes.note(tick, [SectorIndex(-1, 0)] if tick == 1000 else [])
         filled, waiting = world.volumes.fill(tick, -np.inf, lambda sector: world._shown(sector, light), world._placeholder)
         assert len(filled) == 1
         order += filled
@@ -49,7 +50,8 @@ def test_no_volume_is_begun_when_the_ticks_time_for_them_is_over(world, engine, 
     players, light = far_from_the_change(world, engine)
     looks = count(1)
     monkeypatch.setattr("gi_core.live_volumes.time", SimpleNamespace(perf_counter=lambda: float(next(looks))))
-    world.volumes.note(1000, players.ids, players.positions, [SectorIndex(0, 0)])
+    world.volumes.follow(1000, players.ids, players.positions)
+    world.volumes.note(1000, [SectorIndex(0, 0)])
     # A second passes with each look at the clock: the first volume needs none, one begins at 1 s, another at 2 s, none at 3 s.
     filled, waiting = world.volumes.fill(1000, 3.0, lambda sector: world._shown(sector, light), world._placeholder)
     assert (len(filled), waiting) == (3, 5)
