@@ -1,12 +1,11 @@
 """A player's irradiance volume in the live world: kept on the device, and filled anew only where light has changed or the player moved.
 
-On the device it lies like a torus along x and z: a voxel's place is its lattice index modulo the volume's size, so that all that a step
-leaves in sight stays where it is, and only columns that come into sight are filled.
+On the device each of its layers is a ring: a column's place is z * width + x of its lattice index, modulo the layer's columns. So all that
+a step leaves in sight stays where it is, only columns that come into sight are filled, and a layer is read in two pieces.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -21,6 +20,7 @@ from gi_core.live_sector import LiveSector
 from gi_core.recycled import RecycledArrays
 from gi_core.volume import SectorBox, box_mask, box_record, box_slices, nearest_columns, plan_boxes
 
+_COLUMNS = VOLUME_SHAPE[1] * VOLUME_SHAPE[2]
 # Light of a sector to show at this tick, on the device.
 ShownCubes = Callable[[LiveSector], cl.Buffer]
 
@@ -79,7 +79,7 @@ class LiveVolume:
         self._arrays = arrays or volume_arrays(basis)
         self._buffer = device.allocate(4 * 3 * BASIS_SIZES[basis] * int(np.prod(VOLUME_SHAPE)))
         self._filled_at = -1
-        self._torus: tuple[Any, cl.Event] | None = None
+        self._rings: tuple[Any, cl.Event] | None = None
         """The filled buffer, once the event says so: from ``enqueue`` to ``publish``."""
 
     @property
@@ -106,12 +106,13 @@ class LiveVolume:
             cubes = shown(sector) if parts else None
             for part in parts:
                 x, _, z = part.lattice_first
-                on_torus = replace(part, volume_first=(x % VOLUME_SHAPE[2], part.volume_first[1], z % VOLUME_SHAPE[1]))
-                record = box_record(on_torus, sector.resident.sector)
+                line, column = divmod(_on_ring(x, z), VOLUME_SHAPE[2])
+                placed = replace(part, volume_first=(column, part.volume_first[1], line))
+                record = box_record(placed, sector.resident.sector)
                 sector.resident.fill_volume(record, part.size, self._buffer, cubes, self.basis)
-        # Mapped: on a processor that is the device's own memory. Reading rectangles takes twice as long.
-        shape = (BASIS_SIZES[self.basis], *VOLUME_SHAPE, 3)
-        self._torus = cl.enqueue_map_buffer(self._device.queue, self._buffer, cl.map_flags.READ, 0, shape, np.float32, is_blocking=False)
+        # Mapped: on a processor that is the device's own memory.
+        shape = (BASIS_SIZES[self.basis] * VOLUME_SHAPE[0], _COLUMNS, 3)
+        self._rings = cl.enqueue_map_buffer(self._device.queue, self._buffer, cl.map_flags.READ, 0, shape, np.float32, is_blocking=False)
 
     def publish(self, tick: int, placeholder: Callable[[SectorIndex], Float32]) -> PublishedVolume:
         """Read what ``enqueue`` asked for, put placeholders in, and show it."""
@@ -131,16 +132,17 @@ class LiveVolume:
         return self.published
 
     def _read(self, values: Float32) -> None:
-        """Roll the torus out: up to four blocks, whose columns lie beside one another."""
+        """Roll the rings out."""
         assert self._layout is not None
-        assert self._torus is not None
-        (torus, filled), self._torus = self._torus, None
+        assert self._rings is not None
+        (rings, filled), self._rings = self._rings, None
         first_x, _, first_z = self._layout.first.tolist()
-        lines, columns = _runs(first_z, VOLUME_SHAPE[1]), _runs(first_x, VOLUME_SHAPE[2])
+        at = _on_ring(first_x, first_z)
+        layers = values.reshape(rings.shape)
         filled.wait()
-        with torus.base:
-            for (z, from_z), (x, from_x) in product(lines, columns):
-                values[:, :, z, x] = torus[:, :, from_z, from_x]
+        with rings.base:
+            layers[:, : _COLUMNS - at] = rings[:, at:]
+            layers[:, _COLUMNS - at :] = rings[:, :at]
 
 
 def came_into_sight(box: SectorBox, first: Int64, before: Int64) -> list[SectorBox]:
@@ -168,10 +170,9 @@ def came_into_sight(box: SectorBox, first: Int64, before: Int64) -> list[SectorB
     return parts
 
 
-def _runs(first: int, count: int) -> list[tuple[slice, slice]]:
-    """Columns of one axis of a volume at a lattice index: where in the volume, and where in the torus, in two runs at most."""
-    at = first % count
-    return [(slice(0, count - at), slice(at, count)), (slice(count - at, count), slice(0, at))][: 2 if at else 1]
+def _on_ring(x: int, z: int) -> int:
+    """The place of a column of the lattice in its layer's ring."""
+    return (z * VOLUME_SHAPE[2] + x) % _COLUMNS
 
 
 def volume_arrays(basis: str) -> RecycledArrays:

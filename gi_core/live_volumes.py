@@ -58,6 +58,11 @@ class LiveVolumes:
         """Sectors that published volumes read and that are not there."""
         return tuple(index for index in self.looked_at if index not in self._residents)
 
+    @property
+    def are_behind(self) -> bool:
+        """Whether any has to be filled."""
+        return bool(self._behind)
+
     def follow(self, tick: int, ids: Sequence[str], positions: Float64) -> None:
         """Have volumes stand where players are: ``ids`` (p) at positions (p, 3) [m]. Those who moved to other voxels have to be filled."""
         for gone in self.of_player.keys() - set(ids):

@@ -4,7 +4,8 @@ A tick, in order:
 
     relight      take over sectors that loaders have put on the device and lit, and relight those that tick_plan chooses; in an idle world
                  one that has not settled exactly
-    stream       while the device is at it, plan loads and evictions for where players are and go, and have volumes follow players
+    stream       while the device is at it, have volumes follow players, and plan loads and evictions for where they are and go; a tick that
+                 has much to do leaves that to the next, for a while
     volumes      of players who moved, or near whom something was relit, until the tick's time for it is spent; the rest wait
     shadow map   draw some more of the next one; sectors take samples of one that was just drawn
 
@@ -51,6 +52,9 @@ from gi_core.volume import box_record, plan_boxes
 from gi_core.world import Lamp
 
 DEFAULT_BUDGET_BYTES = 512 << 20
+# A tick with sectors to relight or volumes to fill leaves planning to later ones, at most so often on end. Sectors are planned for seconds
+# ahead.
+MOST_PUT_OFF = 3
 # While a volume gets within this [s] to a sector that is not there, those that are loaded leave most of their light to ticks.
 HURRY_S = 1.0
 
@@ -124,6 +128,8 @@ class LiveWorld:
         self.streamer = Streamer(sector_table(dataset.world), dataset.sector, self._place, options, self._right_of_way)
         self.streamer.lamps_planned = bool(dataset.world.lamps)
         self.volumes = LiveVolumes(self._device, frozenset(dataset.world.sectors), self.streamer.residents, basis)
+        self._put_off = 0
+        """How many ticks ago the streaming plan was wanted."""
         self._needs = LightNeeds(len(self.streamer.table.sectors))
         self._row = {index: row for row, index in enumerate(self.streamer.table.sectors)}
         self._light: LiveLight | None = None
@@ -172,11 +178,10 @@ class LiveWorld:
         report.missing = self.volumes.missing
         lap("relight")
         # While the device is at it.
-        self.plan = self.streamer.step(players.positions, players.velocities)
-        report.evicted = self.plan.evictions
-        lap("stream")
         self.volumes.follow(tick, players.ids, players.positions)
         lap("volumes")
+        report.evicted = self._stream(players, is_busy=bool(relit) or self.volumes.are_behind)
+        lap("stream")
         self._end_relight(relit, tick, light, report)
         lap("relight")
         changed = self._advance(tick, gains_changed, report)
@@ -296,6 +301,15 @@ class LiveWorld:
     def _count_lamps(self, index: SectorIndex, sector: LiveSector) -> None:
         if sector.lamps.nbytes:  # dozens of lamps cast more shadows than there was room for
             self.streamer.count_again(index, lamps=False)
+
+    def _stream(self, players: TickPlayers, is_busy: bool) -> tuple[SectorIndex, ...]:
+        """Plan for where players are and go, and see to it; evicted sectors."""
+        if is_busy and self._put_off < MOST_PUT_OFF and not self.streamer.is_overfull:
+            self._put_off += 1
+            return ()
+        self._put_off = 0
+        self.plan = self.streamer.step(players.positions, players.velocities)
+        return self.plan.evictions
 
     def _step_shadows(self, players: TickPlayers, light: LiveLight, boxes: Sequence[MovingBox]) -> None:
         if self._shadows is None:

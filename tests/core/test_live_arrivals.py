@@ -14,7 +14,7 @@ from gi_core.engine import Engine
 from gi_core.grid import SectorIndex
 from gi_core.live_sector import FADE_TICKS
 from gi_core.live_volumes import HELD_TICKS
-from gi_core.live_world import LiveWorld, TickReport
+from gi_core.live_world import MOST_PUT_OFF, LiveWorld, TickReport
 from gi_core.world import Lamp
 
 
@@ -157,7 +157,7 @@ def test_a_plan_holds_while_somebody_drives_straight_on(world, engine, monkeypat
         now[0] += 1 / 30
         run.tick(at(STREET + step * EAST, velocity=30 * EAST), light)
     assert len(plans) == 1
-    for _ in range(2):  # it does not go on
+    for _ in range(2 + MOST_PUT_OFF):  # it does not go on
         now[0] += 1 / 30
         run.tick(at(STREET + 29 * EAST, velocity=30 * EAST), light)
     assert len(plans) > 1
