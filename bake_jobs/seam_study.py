@@ -20,6 +20,7 @@ from gi_core.engine import Engine
 from gi_core.errors import InputError, SectorlightError
 from gi_core.grid import SectorIndex, voxel_centre
 from gi_core.lighting import Lighting
+from gi_core.sector import Sector
 from gi_core.spectrum import LUMINANCE_FROM_RGB
 from gi_core.volume import Volume
 
@@ -120,11 +121,16 @@ def shared_probes(engine: Engine, lighting: Lighting) -> Float64:
     seen: dict[tuple[int, ...], list[Float64]] = {}
     for index in sorted(dataset.world.sectors):
         faces = convert(engine.lit_sector(index, lighting), dataset.world.basis, "cube") @ LUMINANCE_FROM_RGB
-        place = np.round((dataset.sector(index).probe_position + index.origin) * PLACES_PER_M).astype(np.int64)
-        for key, light in zip(map(tuple, place.tolist()), faces, strict=True):
+        for key, light in zip(probe_places(index, dataset.sector(index)), faces, strict=True):
             seen.setdefault(key, []).append(light)
     pairs = np.array([pair for lights in seen.values() for pair in combinations(lights, 2)]).reshape(-1, 2, 6)
     return relative_step(pairs[:, 0], pairs[:, 1])
+
+
+def probe_places(index: SectorIndex, sector: Sector) -> list[tuple[int, ...]]:
+    """Where a sector's probes stand: the same for one probe in all sectors that store it."""
+    place = np.round((sector.probe_position + index.origin) * PLACES_PER_M).astype(np.int64)
+    return list(map(tuple, place.tolist()))
 
 
 def relative_step(a: Float64, b: Float64) -> Float64:
