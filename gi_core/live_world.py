@@ -16,6 +16,7 @@ anybody's. No file is read and no kernel compiled in it, once ``warm_up`` has ru
 import threading
 import time
 from collections.abc import Callable, Collection, Sequence
+from concurrent.futures import Executor
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
@@ -25,7 +26,7 @@ import numpy as np
 import pyopencl as cl
 
 from gi_core.arrays import Float32, Float64
-from gi_core.background import RightOfWay
+from gi_core.background import RightOfWay, background_thread
 from gi_core.basis import conversion
 from gi_core.constants import BASIS_SIZES, VOLUME_SHAPE
 from gi_core.dataset import Dataset
@@ -197,6 +198,10 @@ class LiveWorld:
     def undisturbed(self) -> AbstractContextManager[None]:
         """For a tick: meanwhile threads that load and plan stand still, unless somebody looks at sectors that are not there."""
         return nullcontext() if self.plan is not None and self.plan.missing else self._right_of_way.taken()
+
+    def background_thread(self, name: str) -> Executor:
+        """A thread for work that gives way to ticks."""
+        return background_thread(name, self._right_of_way)
 
     def warm_up(self) -> None:
         """Compile and run every kernel that light may ask for, on the dataset's smallest lit sector: a first run takes seconds, later

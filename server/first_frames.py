@@ -1,7 +1,7 @@
 """Whose turn it is to get a first frame: a whole volume, which takes some milliseconds to encode, where most ticks have nothing to encode.
 
 When fifty streams open at once, those fifty frames would take both encoders and half of Python's lock from several ticks on end. So each
-tick lets a few of them begin, in the order in which they came: ticks keep their time, and so do the streams that are there already.
+tick lets one of them begin, in the order in which they came: ticks keep their time, and so do the streams that are there already.
 """
 
 import asyncio
@@ -9,7 +9,7 @@ from collections import deque
 
 from server.tick_signal import TickSignal
 
-FIRST_FRAMES_PER_TICK = 2
+FIRST_FRAMES_PER_TICK = 1
 
 
 class FirstFrames:

@@ -5,7 +5,7 @@ A server that only answers queries has no live world: no thread, no memory, no k
 
 import logging
 import threading
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -62,8 +62,7 @@ class Live:
         self.kept = KeptEdits(options.state_file)
         self._state = self._starting_state()
         self._ticker: Ticker | None = None
-        self.walkers = ThreadPoolExecutor(1, thread_name_prefix="walker")
-        """Plans walks, which takes up to a second of reading and computing: one at a time, so that ticks and replies keep their share."""
+        self._walkers: Executor | None = None
         self._lock = threading.Lock()
         self._closed = False
 
@@ -86,9 +85,17 @@ class Live:
             if self._ticker is None:
                 options = self.options
                 world = LiveWorld(self.dataset, options.device, budget_bytes=options.budget_bytes, places=options.places)
+                self._walkers = world.background_thread("walker")
                 self._ticker = Ticker(world, self._state, options.sky)
                 self._ticker.start()
             return self._ticker
+
+    @property
+    def walkers(self) -> Executor:
+        """Plans walks, which takes up to a second of reading and computing: one at a time, giving way to ticks. Starts the live world."""
+        self.ticker  # noqa: B018
+        assert self._walkers is not None
+        return self._walkers
 
     def start_if_needed(self) -> None:
         """Start at once when somebody walks from the start."""
@@ -114,7 +121,8 @@ class Live:
             ticker = self._ticker
         if ticker is not None:
             ticker.stop()
-        self.walkers.shutdown(cancel_futures=True)
+        if self._walkers is not None:
+            self._walkers.shutdown(cancel_futures=True)
 
     def _starting_state(self) -> LiveState:
         options, world = self.options, self.dataset.world

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gi_core.background import give_way
 from gi_core.constants import VOXEL_SIZE_M
 from gi_core.dataset import Dataset
 from gi_core.errors import InputError
@@ -142,6 +143,7 @@ class _Walker:
 
     def _run(self, at: Place, way: float, kind: int, most_m: float) -> _Run:
         """How far a ray gets from a place before it leaves the street (Amanatides and Woo's walk over the columns it crosses)."""
+        give_way()
         (px, pz), (dx, dz) = (at[0] / VOXEL_SIZE_M, at[1] / VOXEL_SIZE_M), _direction(way)
         x, z = math.floor(px), math.floor(pz)
         step_x, next_x, per_x = _axis(px, x, dx)
