@@ -162,11 +162,11 @@ def _of_surfels(sector: Sector, of_bricks: Float32) -> Float32:
 
 def _carried_back(sector: Sector, factors: Any, wanted: Float32, albedo: Float32) -> tuple[Float32, Float32]:
     """What the texel gets per first exitance of each brick (N, 6, 3), and of each sky patch (T, 6, 3)."""
-    bounces = _bounces(sector, albedo)
+    bounces, to_bricks = _bounces(sector, albedo), factors[: sector.brick_count]
     step = np.repeat(wanted[:, :, None], CHANNELS, axis=2)
     total, before = step.copy(), np.abs(step).sum(axis=0)
     for _ in range(MAX_PASSES):
-        of_bricks = (factors @ step.reshape(len(step), -1))[: sector.brick_count].reshape(-1, FACES, CHANNELS)
+        of_bricks = (to_bricks @ step.reshape(len(step), -1)).reshape(-1, FACES, CHANNELS)
         step = np.stack([bounce @ of_bricks[:, :, channel] for channel, bounce in enumerate(bounces)], axis=2)
         total += step
         change = np.abs(step).sum(axis=0)

@@ -43,7 +43,8 @@ def gather(gbuffer: GBuffer, pattern: RayPattern, surfels: Surfels, sky_patches:
     bricks, size = len(surfels.brick_cell), pattern.weight.shape[1]
     probe, ray = np.divmod(surfels.hit, gbuffer.rays)
     pair, inverse = distinct(probe * bricks + surfels.brick_of_surfel[surfels.of_hit])
-    brick_weight = np.stack([np.bincount(inverse, pattern.weight[ray, b], len(pair)) for b in range(size)], axis=1)
+    columns = np.ascontiguousarray(pattern.weight.T)
+    brick_weight = np.stack([np.bincount(inverse, column.take(ray), len(pair)) for column in columns], axis=1)
     pair_probe, pair_brick = np.divmod(pair, max(bricks, 1))
 
     sky = sky_factors(gbuffer, pattern)

@@ -10,6 +10,7 @@ is likest along the surfel's normal. What a surfel is lit by stays one probe, an
 import numpy as np
 
 from bake_jobs.adaptive import DARK, Trial
+from bake_jobs.distinct import least
 from bake_jobs.gbuffer import GBuffer
 from bake_jobs.placement import Placement
 from bake_jobs.surfels import Surfels
@@ -20,7 +21,7 @@ from gi_core.basis import feedback_weights
 
 # Closer, the closest probe is as good: the light of a place is not another's yet, and trial light is no better than a guess.
 FAR_M = 16.0
-SURFELS_AT_ONCE = 512
+SURFELS_AT_ONCE = 128
 
 
 def likest_where_far(
@@ -41,8 +42,7 @@ def likest_where_far(
     Rooms are lit by their own probes. Where it is dark by day the closest probe stays: lamps are for those who see them.
     """
     distance = gbuffer.hits.distance[surfels.hit]
-    order = np.lexsort((distance, surfels.of_hit))
-    closest = order[np.searchsorted(surfels.of_hit[order], np.arange(surfels.count))]
+    closest = least(distance, surfels.of_hit, surfels.count)
     far = np.flatnonzero(distance[closest] >= FAR_M)
     # Where a ray met the surface: the mean of what a wide cell holds may lie inside a house.
     met = surfels.hit[closest[far]]

@@ -12,7 +12,7 @@ import numpy as np
 
 from bake_jobs.clean import closed_components
 from bake_jobs.rays import RayScene
-from gi_core.arrays import Bool, Float32, Float64, Int32, Int64
+from gi_core.arrays import Bool, Float32, Float64, Int32
 
 # A ray that has crossed this many surfaces is believed as it stands: overlapping parts of a tower have some ten.
 MAX_CROSSINGS = 64
@@ -44,11 +44,6 @@ STEEP_DIRECTIONS: Float32 = np.concatenate([_UPWARD, _ring(4, _STEEP_ELEVATION, 
 FLAT_DIRECTIONS: Float32 = _ring(8, _FLAT_ELEVATION, 0.243).astype(np.float32)
 
 
-def _fan(points: Float64, directions: Float32) -> tuple[Float64, Float32]:
-    """Every direction from every point: origins (n * r, 3) and directions (n * r, 3), point by point."""
-    return np.repeat(points, len(directions), axis=0), np.tile(directions, (len(points), 1))
-
-
 class Solids:
     """A scene's solids, ready to be asked what lies in them. ``grown`` : they, each a little larger, so that no two surfaces coincide."""
 
@@ -62,16 +57,24 @@ class Solids:
         # Most air sees straight up, and is done after one ray.
         up = np.tile(np.array([[0, 1, 0]], np.float32), (len(points), 1))
         unsure = np.flatnonzero(self.grown.occluded(points, up))
-        unsure = unsure[self.votes(points[unsure], STEEP_DIRECTIONS) >= VOTES_FOR_SOLID]
-        has_sides = self.votes(points[unsure], FLAT_DIRECTIONS) >= SIDES_FOR_SOLID
+        unsure = unsure[self.have_votes(points[unsure], STEEP_DIRECTIONS, VOTES_FOR_SOLID)]
         below = self.grown.closest(points[unsure], -up[unsure])
-        inside[unsure] = has_sides | ~below.hit | below.from_back
+        inside[unsure] = ~below.hit | below.from_back
+        on_floor = unsure[~inside[unsure]]
+        inside[on_floor] = self.have_votes(points[on_floor], FLAT_DIRECTIONS, SIDES_FOR_SOLID)
         return inside
 
-    def votes(self, points: Float64, directions: Float32) -> Int64:
-        """(n,) int64: along how many of the directions (r, 3) a ray from each point (n, 3) leaves more than it has entered."""
-        left = self._leaves(*_fan(points, directions))
-        return left.reshape(len(points), len(directions)).sum(axis=1)
+    def have_votes(self, points: Float64, directions: Float32, enough: int) -> Bool:
+        """(n,) bool: whether rays from each point (n, 3) leave more than they have entered along at least ``enough`` of directions (r, 3).
+
+        Direction by direction: for points that are decided, no more rays are cast.
+        """
+        votes = np.zeros(len(points), np.int64)
+        open_ = np.arange(len(points))
+        for left, direction in zip(range(len(directions))[::-1], directions, strict=True):
+            votes[open_] += self._leaves(points[open_], np.tile(direction, (len(open_), 1)))
+            open_ = open_[(votes[open_] < enough) & (votes[open_] + left >= enough)]
+        return votes >= enough
 
     def _leaves(self, origins: Float64, directions: Float32) -> Bool:
         """(n,) bool: each ray comes to a point where it has met more surfaces from behind than from the front."""

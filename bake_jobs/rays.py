@@ -59,11 +59,14 @@ class RayScene:
 
     def closest(self, origins: Float64, directions: Float64 | Float32) -> Hits:
         """First surface along each ray: origins (n, 3) [m], world frame; directions (n, 3), unit."""
-        n = len(origins)
+        return self.closest_from(self.local(origins), directions)
+
+    def closest_from(self, origin: Float32, directions: Float64 | Float32) -> Hits:
+        """``closest`` from origins (n, 3) of ``local``: for points that many rays start from."""
+        n = len(origin)
         direction = np.ascontiguousarray(directions, np.float32)
         if self._empty or n == 0:
             return Hits(np.full(n, np.inf, np.float32), np.full(n, -1, np.int32), np.zeros((n, 3), np.float32), np.zeros(n, bool))
-        origin = self.local(origins)
         found = self._scene.run(origin, direction, output=True)
         triangle = found["primID"].astype(np.int32)
         hit = triangle >= 0

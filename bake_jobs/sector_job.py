@@ -20,7 +20,7 @@ from bake_jobs.served_error import ServedError
 from bake_jobs.surface_fit import SurfaceFit
 from bake_jobs.target_error import TargetSearch
 from bake_jobs.trial_light import TrialScene
-from bake_jobs.trial_states import trial_states
+from bake_jobs.trial_states import TrialStates, trial_states
 from gi_core import factor_weights, fine_file, geometry_file, sector_file
 from gi_core.arrays import Float32, Float64
 from gi_core.constants import ALBEDO_MAX
@@ -69,9 +69,14 @@ class SectorBaker:
         self._cut = lru_cache(maxsize=CUT_KEPT)(self.cutter.cut)
         self.transfers = TransferBaker(scene, sun_directions, settings.sky_sources, self.rays)
         self._pattern = gbuffer.cube_map_pattern(settings.rays_per_face_edge, settings.basis)
-        tries = settings.placement == "adaptive" or settings.voxel_weights == "fitted"
-        self.trial = self._trial_scene(settings.trial_rays_per_face_edge) if tries else None
-        self._readers = self._trial_scene(READER_RAYS_PER_FACE_EDGE) if settings.wall_weights == "fitted" else None
+        self.trial: TrialScene | None = None
+        self._readers: TrialScene | None = None
+        if settings.placement == "adaptive" or settings.voxel_weights == "fitted":
+            states = trial_states(sun_directions, bool(scene.lamps) or bool(scene.emission.any()))
+            self.trial = self._trial_scene(settings.trial_rays_per_face_edge, states)
+            # Weights and far surfels go by fitted states alone; where probes of their own are worth it, readers tell by all.
+            of_readers = states if settings.reader_probes else states.without_held_out()
+            self._readers = self._trial_scene(READER_RAYS_PER_FACE_EDGE, of_readers)
         self._served_error = self._judge() if settings.target_error and settings.placement == "adaptive" else None
 
     def bake(self, index: SectorIndex) -> BakedSector:
@@ -124,9 +129,9 @@ class SectorBaker:
         clustered = surfels.cluster(seen, room, index.origin, scene.albedo, scene.emission, settings.cells_double_beyond_m)
         weights = factors.gather(seen, self._pattern, clustered, None if settings.sky == "faces" else settings.sky_patches)
         feedback_probe, feedback_weight = surfels.feedback(clustered, seen, settings.feedback_probes)
-        if settings.far_feedback == "likest" and trial is not None and self.trial is not None:
+        if settings.far_feedback == "likest" and trial is not None and self._readers is not None:
             feedback_probe, feedback_weight = far_feedback.likest_where_far(
-                clustered, seen, room, placed, trial, self.trial, feedback_probe, feedback_weight
+                clustered, seen, room, placed, trial, self._readers, feedback_probe, feedback_weight
             )
         surface_fit = self._surface_fit(index, geometry, placed, trial)
         lattice = voxels.bake_voxels(rays, self._solids, _surfaces(geometry), index, placed, settings, scene.rooms, trial, surface_fit)
@@ -175,15 +180,14 @@ class SectorBaker:
             meta["estimated_error"] = round(lattice.estimated_error, 5)
         return sector, meta
 
-    def _trial_scene(self, edge: int) -> TrialScene:
+    def _trial_scene(self, edge: int, states: TrialStates) -> TrialScene:
         scene = self._scene
-        states = trial_states(self._sun_directions, bool(scene.lamps) or bool(scene.emission.any()))
         return TrialScene(self.rays, scene.albedo, scene.emission, scene.lamps, states, edge)
 
     def _surface_fit(
         self, index: SectorIndex, geometry: Geometry, placed: placement.Placement, trial: adaptive.Trial | None
     ) -> SurfaceFit | None:
-        if trial is None or self._readers is None:
+        if trial is None or self._readers is None or self._settings.wall_weights == "nearest":
             return None
         steps = [(x, z) for z in (-1, 0, 1) for x in (-1, 0, 1) if (x, z) != (0, 0)]
         around = [self._cut(SectorIndex(index.x + x, index.z + z)) for x, z in steps]

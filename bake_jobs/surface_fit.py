@@ -21,7 +21,7 @@ from bake_jobs.inside import Solids
 from bake_jobs.placement import Placement
 from bake_jobs.rays import SURFACE_OFFSET_M, RayScene
 from bake_jobs.trial_fit import relative_rows
-from bake_jobs.trial_light import TrialScene
+from bake_jobs.trial_light import Cells, TrialScene
 from gi_core.ambient_cube import FACE_DIRECTIONS
 from gi_core.arrays import Bool, Float32, Float64, Int64, UInt16
 from gi_core.constants import ROOM_OUTDOORS, VOXEL_SIZE_M
@@ -84,7 +84,7 @@ class SurfaceFit:
         trial_scene: TrialScene,
     ) -> None:
         """``geometry``: the sector's surface; ``around``: its neighbours', parts of which read its voxels; ``trial_scene`` lights readers,
-        a few rays do: several share a voxel."""
+        in the fitted states at least, by a few rays: several share a voxel."""
         self._ray_scene, self._solids, self._rooms = ray_scene, solids, rooms
         self._geometry, self._around = geometry, around
         self._placement, self._settings, self._trial, self._trial_scene = placement, settings, trial, trial_scene
@@ -129,9 +129,16 @@ class SurfaceFit:
         """Readers on both sides of the surface, where there is air outdoors and they read a wanted voxel."""
         area_m2 = COARSE_AREA_M2 if voxel_size_m == VOXEL_SIZE_M else FINE_AREA_M2
         # Those beyond a border are the very ones of the sector there: both fit voxels beside it to the same.
-        sides = [self.both_sides(area_m2, geometry) for geometry in (self._geometry, *self._around)]
-        point, normal = (np.concatenate(parts) for parts in zip(*sides, strict=True))
         off = 0.25 * voxel_size_m
+        low, high = voxel_centre(lattice[0, 0, 0] - 1, voxel_size_m), voxel_centre(lattice[-1, -1, -1] + 1, voxel_size_m)
+        points, normals = [], []
+        for geometry in (self._geometry, *self._around):
+            point, normal = self.both_sides(area_m2, geometry)
+            at = point + off * normal
+            within = ((at > low) & (at < high)).all(axis=1)
+            points.append(point[within])
+            normals.append(normal[within])
+        point, normal = np.concatenate(points), np.concatenate(normals)
         voxel, reads = _mixed(point + off * normal, lattice, voxel_size_m)
         reads = reads * wanted[voxel]
         some = np.flatnonzero(reads.sum(axis=1) > LEAST_READ)
@@ -153,8 +160,9 @@ class SurfaceFit:
         return place, ~self._solids.contain(place) & (rooms_of(place, self._rooms) == ROOM_OUTDOORS)
 
     def light(self, place: Float64) -> Float32:
-        """(n, S, 6): what is tried out at places (n, 3) [m]."""
-        return self._trial_scene.light(place, self._trial.light.cells).cube
+        """(n, S, 6): what is tried out at places (n, 3) [m], in the readers' scene's states: those held out come last or not at all."""
+        known, states = self._trial.light.cells, self._trial_scene.states
+        return self._trial_scene.light(place, Cells(known.key, known.exitance[:, : states.count])).cube
 
     def unexplained(self, place: Float64, normal: Float64, light: Float32) -> Float64:
         """(n,), 0 to UNSEEN: how far the best blend of probes is from light (n, S, 6) at each place, relative, along its normal."""

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bake_jobs.distinct import distinct
+from bake_jobs.distinct import distinct, least
 from bake_jobs.gbuffer import GBuffer
 from gi_core.arrays import Float32, Float64, Int32, Int64, UInt8, UInt16
 from gi_core.constants import BRICK_CELL_M, MAX_BRICK_LEVEL, ROOM_OUTDOORS, SURFEL_CELL_M
@@ -83,9 +83,11 @@ def rooms_of_hits(gbuffer: GBuffer, probe_room: UInt16, rooms: tuple[Room, ...])
     of its own to protect.
     """
     room = np.full(len(gbuffer.position), ROOM_OUTDOORS, np.uint16)
+    present = np.unique(probe_room[probe_room != ROOM_OUTDOORS])
+    if not len(present):
+        return room
     air = gbuffer.position + gbuffer.hits.normal * KEY_OFFSET_M
     seen_from = np.repeat(probe_room, gbuffer.rays)
-    present = np.unique(probe_room[probe_room != ROOM_OUTDOORS])
     for slack, of_own_probes in ((ROOM_SLACK_M, True), (0.0, False)):
         for number in present[::-1]:
             inside = holds(rooms[number - 1], air, slack, grown=slack > 0)
@@ -158,10 +160,9 @@ def _on_surface(mean: Float64, normal: Float64, hits: Float64, of_hit: Int64) ->
     uneven = np.zeros(len(mean), bool)
     uneven[of_hit[np.abs(np.einsum("ha,ha->h", off, normal[of_hit])) > KEY_OFFSET_M]] = True
     some = np.flatnonzero(uneven[of_hit])
-    some = some[np.lexsort((np.einsum("ha,ha->h", off[some], off[some]), of_hit[some]))]
-    surfel, first = np.unique(of_hit[some], return_index=True)
+    nearest = least(np.einsum("ha,ha->h", off[some], off[some]), of_hit[some], len(mean))
     position = mean.copy()
-    position[surfel] = hits[some[first]]
+    position[uneven] = hits[some[nearest[uneven]]]
     return position
 
 

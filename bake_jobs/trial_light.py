@@ -30,7 +30,8 @@ from gi_core.world import Lamp
 CELL_M = 2.0
 DOUBLE_BEYOND_M = 8.0
 MAX_LEVEL = 8
-POINTS_AT_ONCE = 256
+# What these take at once stays in a processor's cache.
+LOOKED_FROM_AT_ONCE, POINTS_AT_ONCE = 64, 256
 BOUNCE_RAYS = 16
 START_M = 0.02
 # Bits of a cell's x, y and z in its key, after its level and before its direction; half of each range is negative.
@@ -116,15 +117,15 @@ class TrialScene:
         direction = self._pattern.direction
         keys = np.empty((len(points), len(direction)), np.int64)
         clearance = np.empty(len(points), np.float32)
-        anchor = self._rays.anchor
-        for start in range(0, len(points), POINTS_AT_ONCE):
-            some = points[start : start + POINTS_AT_ONCE]
-            hits = self._rays.closest(np.repeat(some, len(direction), axis=0), np.tile(direction, (len(some), 1)))
+        local = self._rays.local(points)
+        for start in range(0, len(points), LOOKED_FROM_AT_ONCE):
+            some = local[start : start + LOOKED_FROM_AT_ONCE]
+            hits = self._rays.closest_from(np.repeat(some, len(direction), axis=0), np.tile(direction, (len(some), 1)))
             distance = hits.distance.reshape(len(some), -1)
             clearance[start : start + len(some)] = distance.min(axis=1)
             # A ray into a corner may end a rounding beyond the edge, in the next cell: keys are taken a little before the end.
             reach = np.where(np.isfinite(distance), distance - np.float32(KEY_OFFSET_M), 0)[:, :, None]
-            at = (some - anchor).astype(np.float32)[:, None] + direction * reach
+            at = some[:, None] + direction * reach
             key = _cell_keys(at.reshape(-1, 3), hits, distance.reshape(-1))
             keys[start : start + len(some)] = key.reshape(len(some), -1)
         return keys, clearance

@@ -49,6 +49,12 @@ class TrialStates:
         """The held-out states; the fitted ones where none is held out."""
         return slice(self.count - self.held_out if self.held_out else 0, self.count)
 
+    def without_held_out(self) -> "TrialStates":
+        """The fitted states alone, and their suns."""
+        suns = slice(0, len(self.sun_direction) - self.held_out)
+        of_suns, states = self.sun_irradiance[suns, self.fitted], self.fitted
+        return TrialStates(self.sun_direction[suns], of_suns, self.sky_of[states], self.sky_level[states], self.lamps[states], 0)
+
     def sky_radiance(self, directions: Float32) -> Float32:
         """(n, S): what the sky sends along unit directions (n, 3) in each state; 0 from below the horizon."""
         up = np.maximum(directions[:, 1], 0)

@@ -131,7 +131,8 @@ def blend(
             continue
         tree = cKDTree(placement.position[available])
         at_border = to_border(centre[members]).min(axis=1) < FADE_M
-        for some, most in ((members[~at_border], settings.voxel_candidates), (members[at_border], CANDIDATES_AT_BORDER)):
+        for fades, most in ((False, settings.voxel_candidates), (True, CANDIDATES_AT_BORDER)):
+            some = members[at_border == fades]
             candidates = min(max(most, settings.voxel_candidates), len(available))
             distance, near = tree.query(centre[some], k=candidates)
             distance, near = distance.reshape(len(some), candidates), available[near.reshape(len(some), candidates)]
@@ -139,16 +140,17 @@ def blend(
             blind_member = ~sees.any(axis=1)
             sees[blind_member, 0] = True
             blind[some] = blind_member
-            kept = kept_at_border(centre[some], placement.position[near], settings.margin_m)
+            kept = kept_at_border(centre[some], placement.position[near], settings.margin_m) if fades else 1.0
             closeness = np.where(sees, kept / np.maximum(distance, LEAST_DISTANCE_M) ** 2, 0)
             rows = np.arange(len(some))[:, None]
             share = np.zeros_like(closeness)
             closest = np.argsort(-closeness, axis=1, kind="stable")[:, :k]
             share[rows, closest] = closeness[rows, closest]
-            if fit is not None:
+            if fit is not None and (fades or settings.margin_m > FADE_M):
                 # A fit heeds little how close probes are: what one sector alone holds is kept from it, where it sees anything else.
                 held = held_at_border(centre[some], placement.position[near], settings.margin_m)
                 closeness[((closeness > 0) & held).any(axis=1, keepdims=True) & ~held] = 0
+            if fit is not None:
                 share = fit.shares(some, near, closeness, share)
             best = np.argsort(-share, axis=1, kind="stable")[:, :k]
             probe[some, : best.shape[1]] = near[rows, best]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bake_jobs.choose import Chooser, Pairs, neighbour_pairs
-from bake_jobs.distinct import distinct
+from bake_jobs.distinct import distinct, least
 from bake_jobs.fit import fit_weights
 
 
@@ -152,3 +152,14 @@ def test_distinct_keys_are_those_that_sorting_finds(keys, different):
         expected, of_key = np.unique(some, return_inverse=True)
         np.testing.assert_array_equal(found, expected)
         np.testing.assert_array_equal(number, of_key)
+
+
+def test_the_least_of_each_group_is_the_first_that_sorting_finds():
+    rng = np.random.default_rng(7)
+    values, group = rng.integers(0, 5, 400).astype(np.float32), rng.integers(0, 60, 400)
+    group[group == 31] = 30
+    order = np.lexsort((values, group))
+    named, first = np.unique(group[order], return_index=True)
+    expected = np.zeros(60, np.int64)
+    expected[named] = order[first]
+    np.testing.assert_array_equal(least(values, group, 60), expected)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bake_jobs.config import settings_for
-from bake_jobs.inside import Solids
+from bake_jobs.inside import FLAT_DIRECTIONS, Solids
 from bake_jobs.placement import CLEARANCE_M, Placement, place_probes
 from bake_jobs.rays import RayScene
 from bake_jobs.scene import ProbeHint
@@ -286,3 +286,13 @@ def test_no_probe_stands_in_a_tower_of_many_overlapping_parts(build):
     core = np.stack([np.full(50, 32.0), np.linspace(0.5, 60, 50), np.full(50, 31.0)], axis=1)
     top = tower.scene().vertices[:, 1]
     assert inside(tower.scene(), core[core[:, 1] < np.sort(top[top > 0])[0]]).all()
+
+
+@pytest.mark.parametrize("enough", [1, 3, 8])
+def test_votes_are_the_same_whether_all_rays_are_cast_or_those_that_decide(build, enough):
+    scene = build().ground().box((10, 0, 10), (30, 8, 40)).box((25, 2, 20), (50, 12, 30)).scene()
+    solids = Solids(scene.vertices, scene.triangles)
+    points = np.random.default_rng(5).uniform((0, 0.1, 0), (64, 14, 64), (300, 3))
+    votes = sum(solids._leaves(points, np.tile(direction, (300, 1))).astype(int) for direction in FLAT_DIRECTIONS)
+    assert set(votes) >= {0, 8}
+    np.testing.assert_array_equal(solids.have_votes(points, FLAT_DIRECTIONS, enough), votes >= enough)
