@@ -9,7 +9,7 @@ from scipy.ndimage import find_objects, label, uniform_filter
 from bake_jobs.rays import RayScene
 from gi_core.arrays import Bool, Float64, Int32, Int64
 from gi_core.constants import ROOM_CELL_M, ROOM_OUTDOORS
-from gi_core.rooms import air_of, rooms_of
+from gi_core.rooms import air_of, holds, rooms_of
 from gi_core.world import Opening, Room
 
 # An author's box may end before its walls or in them: a way from this far inside it to this far outside it, past walls of common depth.
@@ -37,7 +37,8 @@ _NEAR_CELLS = 1.5
 
 def with_openings(rays: RayScene, rooms: tuple[Room, ...]) -> tuple[Room, ...]:
     """Rooms with their openings, what nothing closes: of a box in its six faces, of a mesh between cells. Found rooms have those to the
-    open air already. A door between two rooms is among the openings of both, as one box from either's side to the other's."""
+    open air already, in the wall's inner side. A door between two rooms is among the openings of both, as one box from either's side to the
+    other's, and what leads to the open air ends in the wall's outer side."""
     seen: list[list[Opening]] = []
     for number, room in enumerate(rooms, 1):
         openings = (_face_openings if room.cells is None else _cell_openings)(rays, number, rooms)
@@ -52,7 +53,12 @@ def with_openings(rays: RayScene, rooms: tuple[Room, ...]) -> tuple[Room, ...]:
                 doors[one - 1] += through
                 doors[other - 1] += [replace(door, to=one) for door in through]
     outdoors = [
-        room.openings if room.is_found else tuple(opening for opening in openings if opening.to == ROOM_OUTDOORS)
+        [
+            part
+            for opening in (room.openings if room.is_found else openings)
+            if not opening.to
+            for part in _into_the_open(rays, opening, room)
+        ]
         for room, openings in zip(rooms, seen, strict=True)
     ]
     return tuple(replace(room, openings=(*out, *within)) for room, out, within in zip(rooms, outdoors, doors, strict=True))
@@ -171,21 +177,44 @@ def _is_lined(rays: RayScene, flat: Opening, door: Opening) -> bool:
 
     flat : the opening in one room's side of the wall; door : through the wall
     """
-    low, high = np.array(door.minimum), np.array(door.maximum)
     axis = int(np.argmin(np.subtract(flat.maximum, flat.minimum)))
-    if high[axis] - low[axis] <= OUTSIDE_M:
-        return True
-    along = np.arange(low[axis] + SIDE_M, high[axis] - SIDE_M, THICK_STEP_M)
+    start, stop = door.minimum[axis], door.maximum[axis]
+    return stop - start <= OUTSIDE_M or bool(_lined(rays, door, axis, np.arange(start + SIDE_M, stop - SIDE_M, THICK_STEP_M)).all())
+
+
+def _lined(rays: RayScene, opening: Opening, axis: int, along: Float64) -> Bool:
+    """At which places (n,) [m] along an axis the wall is all around the way through an opening, to ROOM_CELL_M off its rim."""
+    low, high = np.array(opening.minimum), np.array(opening.maximum)
     places = np.tile(_in_door(low, high), (len(along), 1))
     places[:, axis] = along
+    lined = np.ones(len(along), np.bool_)
     for across in (other for other in range(3) if other != axis):
         for edge, sign in ((low, -1.0), (high, 1.0)):
             way = np.zeros(3)
             way[across] = sign
             distance = rays.closest(places, np.tile(way, (len(along), 1))).distance
-            if (distance > abs(edge[across] - places[0, across]) + ROOM_CELL_M).any():
-                return False
-    return True
+            lined &= distance <= abs(edge[across] - places[0, across]) + ROOM_CELL_M
+    return lined
+
+
+def _into_the_open(rays: RayScene, flat: Opening, room: Room) -> list[Opening]:
+    """A flat opening in the wall's inner side, or a little before it, through the wall to where nothing lines it any more: ``_slices``. As
+    it is where no wall of up to THICKEST_M begins, or one that goes on farther, as those around a porch or a passage do."""
+    low, high = np.array(flat.minimum), np.array(flat.maximum)
+    axis = int(np.argmin(high - low))
+    across = np.zeros((2, 3))
+    across[:, axis] = [-INSIDE_M, INSIDE_M]
+    is_room = holds(room, _in_door(low, high) + across)
+    if high[axis] > low[axis] or is_room[0] == is_room[1]:
+        return [flat]
+    way = np.arange(0.0, THICKEST_M + THROUGH_STEP_M / 2, THROUGH_STEP_M)
+    lined = _lined(rays, flat, axis, low[axis] + way * (1 if is_room[0] else -1))
+    begins = int(lined.argmax())
+    if way[begins] > OUTSIDE_M or lined[begins:].all() or not lined.any():
+        return [flat]
+    deep = way[begins + int(lined[begins:].argmin())]
+    (high if is_room[0] else low)[axis] += deep if is_room[0] else -deep
+    return _slices(flat, Opening(point(low.round(4)), point(high.round(4)), flat.to))
 
 
 def _slices(flat: Opening, door: Opening) -> list[Opening]:

@@ -148,9 +148,9 @@ def light_shares(position: Float64, rooms: tuple[Room, ...], surface: Float64 | 
 
     surface : (n, 3) [m], of what is lit, and 2 cm off it: volumes are sampled farther off. None: the positions themselves
 
-    Walls part rooms sharply, whatever is how near. In an opening what lies on its two sides are halves, and so they are in a doorway, from
-    one room's side to the other's; farther off the other side's share falls as the opening does from view. From a wall beside an opening
-    nothing is seen of it, so no bright or dark seam surrounds windows.
+    Walls part rooms sharply, whatever is how near. In an opening what lies on its two sides are halves, from one side of the wall to the
+    other; farther off the other side's share falls as the opening does from view. From a wall beside an opening nothing is seen of it, so
+    no bright or dark seam surrounds windows.
     """
     surface = position if surface is None else surface
     own = rooms_of(position, rooms).astype(np.int64)
@@ -158,20 +158,22 @@ def light_shares(position: Float64, rooms: tuple[Room, ...], surface: Float64 | 
     own[outside] = rooms_of(position[outside], rooms, EDGE_M)
     reached = _reached(surface, rooms, OPENING_DEPTH_M + max((_reach(each) for each in rooms), default=0.0))
     parts: list[tuple[Int64, int, Float32]] = []
-    for number, door in ((each, door) for each in reached for door in rooms[each - 1].openings if door.to):
-        outside = np.flatnonzero(own == ROOM_OUTDOORS)
-        between = outside[_in_box(door, position[outside]) | _in_box(door, surface[outside])]
-        own[between] = _IN_DOORWAY
-        parts += [(between, beyond, np.full(len(between), 0.5, np.float32)) for beyond in (number, door.to)]
+    for number in reached:
+        room = rooms[number - 1]
+        close = [some[own[some] == ROOM_OUTDOORS] for some in (_near(room, position, _reach(room)), _near(room, surface, _reach(room)))]
+        there = position[close[0]], surface[close[1]]
+        for opening in room.openings:
+            between = np.unique(np.concatenate([some[_in_box(opening, place)] for some, place in zip(close, there, strict=True)]))
+            between = between[own[between] == ROOM_OUTDOORS]
+            own[between] = _IN_DOORWAY
+            parts += [(between, beyond, np.full(len(between), 0.5, np.float32)) for beyond in (number, opening.to)]
     for number in reached:
         room = rooms[number - 1]
         near = _near(room, surface, OPENING_DEPTH_M + _reach(room))
         for other in sorted({opening.to for opening in room.openings}):
             # Doors between rooms are among those of both.
             here = near[(own[near] == number) | ((own[near] == ROOM_OUTDOORS) & (other == ROOM_OUTDOORS))]
-            # Openings to the open air lie in walls' inner sides: from the outer ones nothing may be seen of them.
-            nearer = np.where((own[here] == number) | (other != ROOM_OUTDOORS), 0.0, OPENING_DEPTH_M)
-            half = opening_nearness(room, surface[here], other, nearer) / 2
+            half = opening_nearness(room, surface[here], other) / 2
             for inside, lends in ((number, other), (other, number)):
                 seen = (half > 0) & (own[here] == inside)
                 parts.append((here[seen], lends, half[seen]))
@@ -198,22 +200,22 @@ def _in_box(opening: Opening, position: Float64) -> Bool:
     return np.asarray(((position >= opening.minimum) & (position <= opening.maximum)).all(axis=1), np.bool_)
 
 
-def opening_nearness(room: Room, position: Float64, to: int = ROOM_OUTDOORS, nearer_m: float | Float64 = 0.0) -> Float32:
+def opening_nearness(room: Room, position: Float64, to: int = ROOM_OUTDOORS, nearer_m: float = 0.0) -> Float32:
     """(n,) 0..1 at positions (n, 3) [m]: 1 in the openings of a room to another, or to the open air, 0 where each fills less than
     OPENING_LEAST_VIEW of half the view.
 
-    nearer_m : from so much nearer they are seen, at most OPENING_DEPTH_M; a number, or one for each position (n,)
+    nearer_m : from so much nearer they are seen, at most OPENING_DEPTH_M
 
     An opening is the rectangle across the shortest side of its box, seen from as much nearer as that is deep; from x and y off its
     corners, at a distance d, it has a solid angle of the sum of +- atan(x y / (d sqrt(x^2 + y^2 + d^2))).
     """
-    nearness, nearer = np.zeros(len(position), np.float32), np.broadcast_to(nearer_m, len(position))
+    nearness = np.zeros(len(position), np.float32)
     for opening in (each for each in room.openings if each.to == to):
         low, high = np.array(opening.minimum), np.array(opening.maximum)
         reach = OPENING_DEPTH_M + _reach_of(opening)
         near = np.flatnonzero(((position >= low - reach) & (position <= high + reach)).all(axis=1))
         axis = int(np.argmin(high - low))
-        depth = np.abs(position[near, axis] - (low[axis] + high[axis]) / 2) - (high[axis] - low[axis]) / 2 - nearer[near]
+        depth = np.abs(position[near, axis] - (low[axis] + high[axis]) / 2) - (high[axis] - low[axis]) / 2 - nearer_m
         depth = np.maximum(depth, 1e-9)
         u, v = (across for across in range(3) if across != axis)
         angle = np.zeros(len(near))
@@ -233,7 +235,14 @@ def _reach_of(opening: Opening) -> float:
 
 @lru_cache(maxsize=1024)
 def _reach(room: Room) -> float:
-    return max((_reach_of(opening) for opening in room.openings), default=0.0)
+    """How far [m] beyond OPENING_DEPTH_M from a room's box one of its openings, which go out of it through walls, may be near."""
+    return max(
+        (
+            _reach_of(each) + max(0.0, *np.subtract(room.minimum, each.minimum), *np.subtract(each.maximum, room.maximum))
+            for each in room.openings
+        ),
+        default=0.0,
+    )
 
 
 def weight_lattice(first_voxel: Int64, rooms: tuple[Room, ...], numbers: tuple[int, ...], to: int = ROOM_OUTDOORS) -> UInt8:

@@ -121,7 +121,7 @@ class RoomReply(BaseModel):
     shape: Literal["box", "cells"] = Field(description="cells: of its box only those of `kind=interior&weight=1` are its air, as of a mesh")
     found: bool = Field(description="the bake found it, and no author drew it")
     openings: list[OpeningReply] = Field(
-        description="boxes, most of them flat, in which its air meets the open air: windows, and doors, which go on below the floor"
+        description="boxes, most through a wall, in which its air meets the open air: windows, and doors, which go on below the floor"
     )
     doors: list[DoorReply] = Field(description="the same between it and other rooms, from its side of the wall to theirs; each is in both")
 

@@ -61,8 +61,8 @@ def volume(request: Request, service: ServiceDep, query: Annotated[VolumeQuery, 
     view. The share of the interior volume is 1 - n / 2 inside and n / 2 outside: sharp at walls, continuous through openings. Read plane 0
     where volumes are sampled, plane 1 on the surface that is lit, 2 cm off it. n is the largest clamp((angle /
     2 pi - 0.25) / 0.75) of all boxes of openings in `/v1/world`: of each take the rectangle across its shortest side, and the solid angle
-    from 0.390625 m nearer than the cell is. Worked out by oneself, for a point in a room or beyond a door, it is better with the angle from
-    where one is: cells lie up to so far from an opening, and one to the open air is told of in the wall's inner side.
+    from 0.390625 m nearer than the cell is. Worked out by oneself, it is better with the angle from where one is: cells lie up to so
+    far from an opening. In its box both volumes have a half.
     `&room=A&to=B` is the same for the doors from A to another room B, `doors` of `/v1/world`, with both rooms' volumes: the share of B is
     n / 2 in A, that of A n / 2 in B, and each has a half in the doorway, where plane 0 is 127. Where a room has doors and other openings
     near, take all of their shares from it.

@@ -49,9 +49,9 @@ def test_a_house_with_a_door_and_a_window_is_one_room_that_ends_at_its_walls(gro
     np.testing.assert_allclose(room.minimum, (10.3, 0, 20.15), atol=2e-3)
     np.testing.assert_allclose(room.maximum, (18.4, 2.79, 26.2), atol=2e-3)
     door, window = sorted(room.openings, key=lambda opening: opening.minimum[1])
-    # In the wall's inner face, from rim to rim; a door goes on below the floor as far as it is high.
-    np.testing.assert_allclose((door.minimum, door.maximum), ((12.1, -2.0, 20.15), (13.1, 2.0, 20.15)), atol=2e-3)
-    np.testing.assert_allclose((window.minimum, window.maximum), ((10.3, 0.9, 21.95), (10.3, 2.2, 23.35)), atol=2e-3)
+    # From rim to rim, and to the wall's outer side, told to 1 cm; a door goes on below the floor as far as it is high.
+    np.testing.assert_allclose((door.minimum, door.maximum), ((12.1, -2.0, 20.15 - WALL), (13.1, 2.0, 20.15)), atol=0.012)
+    np.testing.assert_allclose((window.minimum, window.maximum), ((10.3 - WALL, 0.9, 21.95), (10.3, 2.2, 23.35)), atol=0.012)
     rng = np.random.default_rng(1)
     inside = rng.uniform(room.minimum, room.maximum, (2000, 3))
     assert holds(room, inside).all()
@@ -160,6 +160,29 @@ def test_a_door_goes_through_a_wall_of_old_masonry(ground, thick, is_drawn):
     assert not shares.of(0, len(x)).any()
     step = 0.05 * np.hypot(0.5, 2) / (0.5 * 2) / (np.pi * (1 - OPENING_LEAST_VIEW))
     assert np.abs(np.diff(shares.of(1, len(x)))).max() <= step * 1.01
+
+
+@pytest.mark.parametrize("is_drawn", [True, False])
+def test_what_leads_to_the_open_air_ends_in_a_thick_wall_s_outer_side(ground, is_drawn):
+    """A door and a window with an awning in a wall of 0.8 m: boxes, each shortest along the way. And a door that a porch goes on from, 2 m
+    deep: nothing tells where the wall ends, so it stays flat in the inner side."""
+    ground.wall((9.8, 20.4), (18.2, 20.4), 2.8, [(1.2, -0.1, 1.9, 2.0), (4.2, 0.9, 5.6, 2.2)], thick=0.8)
+    ground.box((13.5, 2.21, 18.0), (16.0, 2.4, 20.1))
+    ground.wall((9.8, 26.1), (18.2, 26.1), 2.8, [(3.2, -0.1, 4.2, 2.0)])
+    ground.box((12.4, 0, 26.1), (12.9, 2.8, 28.2)).box((14.1, 0, 26.1), (14.6, 2.8, 28.2)).box((12.4, 2.1, 26.1), (14.6, 2.8, 28.2))
+    for x in (9.9, 18.1):
+        ground.wall((x, 20), (x, 26.2), 2.8)
+    ground.box((9.8, 2.79, 20), (18.2, 3.1, 28.2))
+    hall = Room("hall", (10.0, 0.0, 20.8), (18.0, 2.79, 26.0))
+    (room,) = found(ground, "none" if is_drawn else "open", rooms=(hall,) if is_drawn else ())
+    np.testing.assert_allclose((room.minimum, room.maximum), (hall.minimum, hall.maximum), atol=2e-3)
+    outer, inner, window, porch = sorted(
+        room.openings, key=lambda opening: (opening.minimum[2] > 25, opening.minimum[1], opening.minimum[2])
+    )
+    np.testing.assert_allclose((outer.minimum, outer.maximum), ((11.0, -2.0, 20.0), (11.7, 2.0, 20.4)), atol=0.012)
+    np.testing.assert_allclose((inner.minimum, inner.maximum), ((11.0, -2.0, 20.4), (11.7, 2.0, 20.8)), atol=0.012)
+    np.testing.assert_allclose((window.minimum, window.maximum), ((14.0, 0.9, 20.0), (15.4, 2.2, 20.8)), atol=0.012)
+    np.testing.assert_allclose((porch.minimum, porch.maximum), ((13.0, -2.0, 26.0), (14.0, 2.0, 26.0)), atol=0.012)
 
 
 def test_where_a_door_ends_is_told_of_walls_up_to_a_limit(ground):

@@ -133,7 +133,7 @@ def test_a_window_and_a_door_have_each_their_share():
     """Where both are in view, and beside the window, on the street."""
     near = np.array([[3.0, 1.6, 0.5], [3.0, 1.6, -0.5], [9.5, 1.0, 4.0]])
     found = mixed(near)
-    window, door = opening_nearness(HALL, near, nearer_m=np.array([0, OPENING_DEPTH_M, 0])), opening_nearness(HALL, near, 2)
+    window, door = opening_nearness(HALL, near), opening_nearness(HALL, near, 2)
     assert window.min() == door[:2].max() == 0
     np.testing.assert_allclose(found[0], [window[0] / 2, 1 - window[0] / 2, 0], atol=1e-6)
     np.testing.assert_allclose(found[1], [1 - window[1] / 2, window[1] / 2, 0], atol=1e-6)
@@ -154,10 +154,26 @@ def test_an_opening_fills_of_the_view_what_its_solid_angle_is():
     room = Room("hall", (0, 0, 0), (10, 4, 8), (Opening((4.0, 1.0, 0.0), (6.0, 3.0, 0.0)),))
     before = np.array([[5.0, 2.0, 1.0], [5.0, 2.0, -1.0]])
     np.testing.assert_allclose(opening_nearness(room, before), (1 / 3 - 1 / 4) / (3 / 4), atol=1e-6)
-    # Textures have it from an eighth of a voxel nearer, and so it is on the street, where the wall's outer side is.
+    np.testing.assert_allclose(light_shares(before, (room,)).of(1, 2), [1 - 1 / 18, 1 / 18], atol=1e-6)
+    # Textures have it from an eighth of a voxel nearer.
     nearer = opening_nearness(room, before * [1, 1, 1 - OPENING_DEPTH_M])
     np.testing.assert_allclose(opening_nearness(room, before, nearer_m=OPENING_DEPTH_M), nearer, atol=1e-6)
-    np.testing.assert_allclose(light_shares(before, (room,)).of(1, 2), [1 - 1 / 18, nearer[1] / 2], atol=1e-6)
+
+
+def test_in_a_window_through_a_thick_wall_room_and_street_are_halves():
+    """From side to side of a wall of 1 m, reveals included, though light is sampled off those in the masonry; and it ends at the wall."""
+    room = Room("hall", (0, 0, 0), (10, 4, 8), (Opening((4.0, 1.0, -1.0), (6.0, 3.0, 0.0)),))
+    z = np.linspace(-2.0, 1.0, 301)
+    way = np.stack([np.full(301, 5.0), np.full(301, 2.0), z], axis=1)
+    share = light_shares(way, (room,)).of(1, 301)
+    np.testing.assert_allclose(share[(z > -0.999) & (z < -0.001)], 0.5)
+    assert (np.diff(share) >= -1e-6).all()
+    assert np.diff(share).max() < 0.01 * np.sqrt(2) / (0.75 * np.pi)  # MATH.md's bound for half sides of 1 m
+    np.testing.assert_allclose(share + share[::-1], 1, atol=1e-6)
+    reveal = np.array([[4.02, 2.0, -0.9], [5.0, 1.02, -0.5]])
+    np.testing.assert_allclose(light_shares(reveal + 0.78 * np.array([[1, 0, 0], [0, 1, 0]]), (room,), reveal).of(1, 2), 0.5)
+    beside = np.array([[3.9, 2.0, -0.5], [3.9, 2.0, -1.02], [5.0, 3.1, -1.02]])
+    assert not light_shares(beside, (room,)).of(1, 3).any()
 
 
 def test_a_point_a_hair_behind_a_wall_is_the_rooms_that_it_is_seen_from():

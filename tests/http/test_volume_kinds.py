@@ -279,16 +279,17 @@ def test_a_weight_is_sharp_at_walls_and_smooth_through_openings(http: httpx.Clie
     )
     np.testing.assert_array_equal(weight[0] == 255, ((at >= room["minimum"]) & (at <= room["maximum"])).all(axis=-1))
     assert set(np.unique(weight[0]).tolist()) == {0, 255}
-    # Of the openings, rectangles across one axis, the one that fills most of the view; corner by corner as a pair of triangles.
+    # Of the openings, rectangles across their boxes' shortest side, the one that fills most of the view; each as a pair of triangles.
     chosen = np.random.default_rng(2).choice(np.flatnonzero(weight[1].ravel() > 0), 500)
     eye, view = at.reshape(-1, 3)[chosen], np.zeros(500)
     for opening in room["openings"]:
         low, high = np.array(opening["minimum"]), np.array(opening["maximum"])
         axis = int(np.argmin(high - low))
-        assert low[axis] == high[axis]
-        nearer = eye.copy()
+        nearer, deep = eye.copy(), high[axis] - low[axis]
+        assert 0.2 < deep < 0.5  # through the wall
+        low[axis] = high[axis] = low[axis] + deep / 2
         off = eye[:, axis] - low[axis]
-        nearer[:, axis] -= np.sign(off) * np.minimum(np.abs(off) - 1e-9, 0.390625)
+        nearer[:, axis] -= np.sign(off) * np.minimum(np.abs(off) - 1e-9, 0.390625 + deep / 2)
         corners = np.stack([low, low, high, high])
         corners[1, (axis + 1) % 3], corners[3, (axis + 1) % 3] = high[(axis + 1) % 3], low[(axis + 1) % 3]
         a, b, c, d = (corner - nearer for corner in corners)
