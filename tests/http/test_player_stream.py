@@ -10,7 +10,7 @@ import socket
 import struct
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from types import SimpleNamespace
@@ -20,6 +20,7 @@ import httpx
 import numpy as np
 import pytest
 from fastapi import FastAPI
+from serving import PATIENCE_S, until
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
@@ -35,21 +36,11 @@ from server.stream_header import parse_header
 from server.tick_signal import TickSignal
 from server.volume_frames import Frame, VolumeDecoder, VolumeEncoder
 
-PATIENCE_S = 20.0
 # A text frame of a client, masked with zeros.
 # What a thousand clients may leave in memory. Five thousand, a thousand at a time, left 5.4, 0.2, 0.1, 1.0 and 2.5 MB: what the allocator
 # keeps. One encoder of ten that stayed would be 120 MB.
 MOST_GROWTH_BYTES = 16 << 20
 ASK_FULL = b'\x81\x90\0\0\0\0{"type": "full"}'
-
-
-def until(found: Callable[[], Any]) -> Any:
-    """What a function gives, once that is true."""
-    deadline = time.monotonic() + PATIENCE_S
-    while not (value := found()):
-        assert time.monotonic() < deadline, "it did not come to that"
-        time.sleep(0.02)
-    return value
 
 
 class Follower:
@@ -160,7 +151,7 @@ def test_first_frames_take_turns_in_the_order_of_arrival() -> None:
 
     async def run() -> None:
         signal, ticker = TickSignal(), SimpleNamespace(listeners=[])
-        signal.follow(ticker)  # type: ignore[arg-type]
+        signal.follow(ticker)
 
         async def tick(number: int) -> None:
             ticker.listeners[0](TickReport(number))
