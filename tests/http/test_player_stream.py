@@ -29,7 +29,7 @@ from server.app import create_app
 from server.first_frames import FirstFrames
 from server.frame_prefix import FrameKind
 from server.live import LiveOptions
-from server.player_streams import PlayerStreams, is_full_request
+from server.player_streams import MAX_REASON_BYTES, Close, PlayerStreams, close, is_full_request
 from server.routes.live import memory_bytes
 from server.settings import Settings
 from server.stream_header import parse_header
@@ -215,6 +215,17 @@ def test_garbage_ends_a_stream(live_http: httpx.Client, player: str, streams: Pl
 def test_only_a_request_for_a_full_frame_is_one() -> None:
     assert is_full_request('{"type": "full"}')
     assert not any(map(is_full_request, ("", "full", '{"type": 1}', "{}", "null", "[" * 100_000)))
+
+
+def test_a_reason_that_a_close_frame_has_no_room_for_is_cut_between_letters() -> None:
+    said: list[tuple[int, str]] = []
+
+    async def note(code: int, reason: str) -> None:
+        said.append((code, reason))
+
+    asyncio.run(close(SimpleNamespace(close=note), Close(1013, "x" + "ä" * 100)))
+    assert said == [(1013, "x" + "ä" * 61)]
+    assert len(said[0][1].encode()) == MAX_REASON_BYTES
 
 
 def test_a_player_that_is_not_there(live_http: httpx.Client, player: str) -> None:
