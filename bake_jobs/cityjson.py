@@ -4,7 +4,6 @@ Of an object's levels of detail the highest is read. Where nothing lies under a 
 streets which the file leaves out are not holes. Textures and materials of the file are not read.
 """
 
-import json
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,10 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from bake_jobs.geography import MapFrame, centre_of, lonlat_from_epsg, timezone_at
+from bake_jobs.geography import MapFrame, centre_of, lonlat_from, timezone_at
 from bake_jobs.rays import RayScene
 from bake_jobs.scene import Mesh, SourceContent, join_meshes
 from bake_jobs.solids import expect_few_rings, triangulate
+from bake_jobs.table import read_json
 from bake_jobs.terrain import CELL_M, MAX_CELLS, Terrain, cells_needed, terrain_under
 from gi_core.arrays import Bool, Float64, Int64
 from gi_core.errors import SourceError
@@ -82,13 +82,8 @@ def load_cityjson(path: Path, frame: MapFrame | None = None) -> SourceContent:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    try:
-        document = json.loads(path.read_bytes())
-    except (ValueError, RecursionError) as error:
-        raise SourceError(f"{path}: expected CityJSON, found no valid JSON ({error})") from error
-    except OSError as error:
-        raise SourceError(f"{path}: cannot be read ({error.strerror})") from error
-    if not isinstance(document, dict) or document.get("type") != "CityJSON":
+    document = read_json(path, "CityJSON")
+    if document.get("type") != "CityJSON":
         raise SourceError(f'{path}: expected a JSON object whose type is "CityJSON"')
     version = str(document.get("version", ""))
     if not re.match(r"[12]\.", version):
@@ -110,26 +105,20 @@ def _world_vertices(document: dict[str, Any], path: Path, frame: MapFrame | None
         raise SourceError(f"{path}: expected vertices of three numbers and a transform with scale and translate ({error})") from error
     if not len(real):
         raise SourceError(f"{path}: expected vertices, found none")
-    epsg = _epsg(document)
-    if epsg is None:
+    metadata = document.get("metadata")
+    system = metadata.get("referenceSystem") if isinstance(metadata, dict) else None
+    if not system:
         north = frame.north_degrees if frame else 0.0
         middle = np.round((np.nanmin(real, axis=0) + np.nanmax(real, axis=0)) / 2)
         x, z = world_from_east_north(real[:, 0] - middle[0], real[:, 1] - middle[1], north)
         return np.stack([x, real[:, 2], z], axis=1), None
-    lonlat = lonlat_from_epsg(real[:, :2], epsg, str(path))
+    lonlat = lonlat_from(real[:, :2], str(system), f"{path}: referenceSystem")
     frame = frame or MapFrame(*centre_of(lonlat))
     xz = frame.world_from_lonlat(lonlat)
     latitude, longitude = frame.latitude_degrees, frame.longitude_degrees
     elevation = float(np.median(real[:, 2]))
     location = Location(latitude, longitude, elevation, timezone_at(latitude, longitude), frame.north_degrees, source="given")
     return np.stack([xz[:, 0], real[:, 2], xz[:, 1]], axis=1), location
-
-
-def _epsg(document: dict[str, Any]) -> int | None:
-    """The EPSG code of metadata.referenceSystem: a URL that ends in it (1.1, 2.0) or urn:ogc:def:crs:EPSG::7415 (1.0)."""
-    metadata = document.get("metadata")
-    match = re.search(r"EPSG[:/].*?(\d+)$", str(metadata.get("referenceSystem", ""))) if isinstance(metadata, dict) else None
-    return int(match[1]) if match else None
 
 
 def _polygons(document: dict[str, Any], vertex_count: int, path: Path) -> Iterator[_Polygon]:

@@ -22,6 +22,7 @@ from gi_core.container import write_atomic
 from gi_core.dataset import Dataset, write_world
 from gi_core.errors import InputError
 from gi_core.grid import SectorIndex
+from gi_core.outputs import expect_file
 
 SectorRange = tuple[tuple[int, int], tuple[int, int]]
 NEIGHBOURS = tuple((dx, dz) for dx in (-1, 0, 1) for dz in (-1, 0, 1))
@@ -49,10 +50,9 @@ def run(
     """
     if plot_path is not None and plot_path.suffix.lower() != ".png":
         raise InputError(f"--plot {plot_path}: expected a name that ends in .png")
-    for path in (json_path, plot_path):
-        # An hour of path tracing must not be lost to a typing mistake.
-        if path is not None and (path.is_dir() or not path.absolute().parent.is_dir()):
-            raise InputError(f"{path}: expected a file in a folder that exists")
+    for option, path in (("--json", json_path), ("--plot", plot_path)):
+        if path is not None:
+            expect_file(path, option)
     lamps = None if lamps_path is None else load_lamps(lamps_path)
     scene = None if source is None else load_scene(source)
     with Progress(

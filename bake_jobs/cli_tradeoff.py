@@ -13,7 +13,7 @@ from bake_jobs.tradeoff import Sweep, Variant, middle_block, plan, run
 from bake_jobs.tradeoff_report import draw, table
 from bake_jobs.tradeoff_serve import Encoding, with_serving
 from gi_core.container import write_atomic
-from gi_core.errors import InputError
+from gi_core.outputs import expect_folder
 
 
 def sweep(
@@ -34,8 +34,7 @@ def sweep(
 
     Raises InputError for what cannot be swept, and as ``tradeoff.run`` does.
     """
-    if output.exists() and not output.is_dir():
-        raise InputError(f"--output {output}: expected a folder, or a name for a new one; found a file")
+    expect_folder(output, "--output")
     variants = plan(names)
     scene = load_scene(source)
     task = Sweep(source, scene, sectors or middle_block(scene), tuple(states), points, samples, seed)

@@ -2,10 +2,10 @@
 
 Read per feature, in metres: ``base`` (ground height, default 0) and ``height`` above it, or OpenStreetMap's ``height``,
 ``min_height`` (the part hangs in the air below it) and ``building:levels``. Features with the same ``building`` are parts of one
-building and share their colour. Parts may overlap: each stays a closed solid of its own.
+building and share their colour. Parts may overlap: each stays a closed solid of its own. Positions are longitude and latitude, or in the
+system that the file's ``crs`` member names.
 """
 
-import json
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 import shapely
 
-from bake_jobs.geography import MapFrame, centre_of, timezone_at
+from bake_jobs.geography import MapFrame, centre_of, lonlat_of_geojson, timezone_at
 from bake_jobs.scene import Mesh, SourceContent, join_meshes
 from bake_jobs.solids import expect_few_rings, prism
+from bake_jobs.table import read_json
 from bake_jobs.terrain import MAX_CELLS, Terrain, cells_needed, terrain_under
 from gi_core.arrays import Float32, Float64
 from gi_core.errors import SourceError
@@ -38,8 +39,8 @@ ROOF_ALBEDO = (0.3, 0.3, 0.3)
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """One polygon of a feature. rings: outer, then holes, (n, 2) longitude and latitude, closed as in the file; is_guessed: whether its
-    height is, since the feature has none that can be read."""
+    """One polygon of a feature. rings: outer, then holes, (n, 2) positions, closed as in the file; is_guessed: whether its height is,
+    since the feature has none that can be read."""
 
     rings: tuple[Float64, ...]
     building: str
@@ -51,8 +52,9 @@ class _Part:
 
 def load_footprints(path: Path, frame: MapFrame | None = None) -> SourceContent:
     """Read footprints; without a frame the world's origin is the middle of the data. Raises SourceError."""
-    parts = _read_parts(path)
-    lonlat = np.concatenate([ring for part in parts for ring in part.rings])
+    document = read_json(path, "a GeoJSON FeatureCollection")
+    parts = _parts(document, path)
+    lonlat = lonlat_of_geojson(np.concatenate([ring for part in parts for ring in part.rings]), document, str(path))
     _refuse_bad_places(lonlat, path)
     frame = frame or MapFrame(*centre_of(lonlat))
     xz = frame.world_from_lonlat(lonlat)
@@ -85,17 +87,11 @@ def load_footprints(path: Path, frame: MapFrame | None = None) -> SourceContent:
     return SourceContent(join_meshes([*meshes, terrain.mesh()]), location, notes=(note,) if guessed else ())
 
 
-def _read_parts(path: Path) -> list[_Part]:
-    try:
-        document = json.loads(path.read_bytes())
-    except (ValueError, RecursionError) as error:
-        raise SourceError(f"{path}: expected GeoJSON, found no valid JSON ({error})") from error
-    except OSError as error:
-        raise SourceError(f"{path}: cannot be read ({error.strerror})") from error
-    kind = document.get("type") if isinstance(document, dict) else None
+def _parts(document: dict[str, Any], path: Path) -> list[_Part]:
+    kind = document.get("type")
     features = document.get("features") if kind == "FeatureCollection" else [document] if kind == "Feature" else None
     if not isinstance(features, list):
-        raise SourceError(f"{path}: expected a GeoJSON FeatureCollection, found {kind or type(document).__name__}")
+        raise SourceError(f"{path}: expected a GeoJSON FeatureCollection, found {kind}")
     parts = []
     points = 0
     for number, feature in enumerate(features):
@@ -176,7 +172,7 @@ def _refuse_bad_places(lonlat: Float64, path: Path) -> None:
         lon, lat = lonlat[bad][0]
         raise SourceError(
             f"{path}: expected WGS84 longitude and latitude in degrees (RFC 7946), found ({lon:g}, {lat:g}); "
-            "reproject the file to EPSG:4326"
+            "name its system in a crs member, or reproject it to EPSG:4326"
         )
 
 

@@ -108,16 +108,6 @@ class PathTracer:
         project = partial(projection_weights, "cube")
         return self.projected_irradiance(points, lighting, lamps, project, samples=samples, replicates=replicates, seed=seed)
 
-    def sh2_irradiance(
-        self, points: Float64, lighting: Lighting, lamps: Lamps = (), *, samples: int = 1024, replicates: int = 8, seed: int = 0
-    ) -> Estimate:
-        """Real SH of the irradiance at points in air: (n, 3) [m] -> Estimate of (n, 9, 3) [lx], E(normal) = sum c_k Y_k(normal).
-
-        Order 1, y, z, x, xy, yz, 3 z^2 - 1, xz, x^2 - y^2; the cosine convolution is included (Ramamoorthi and Hanrahan 2001).
-        """
-        project = partial(projection_weights, "sh2")
-        return self.projected_irradiance(points, lighting, lamps, project, samples=samples, replicates=replicates, seed=seed)
-
     def surface_irradiance(
         self,
         points: Float64,

@@ -4,6 +4,7 @@ Each sector is a pure function of scene, settings and index, and is written whol
 settings in every sector file, so a bake that is started again skips what an earlier run of the same bake finished.
 """
 
+import errno
 import hashlib
 import json
 import multiprocessing
@@ -51,11 +52,13 @@ from gi_core.distant_transfer import DistantTransfer
 from gi_core.errors import FormatError, InputError, SectorlightError
 from gi_core.grid import SectorIndex
 from gi_core.json_fields import LARGEST_INTEGER
+from gi_core.outputs import expect_folder
 from gi_core.sector import Sector
 from gi_core.sun_table import SunTable
 
 # Part of the bake id: raised whenever the same settings would give other bytes than before.
 BAKER_VERSION = 7
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 SectorRange = tuple[tuple[int, int], tuple[int, int]]
 
 
@@ -66,7 +69,7 @@ class WorkerLostError(SectorlightError, RuntimeError):
 
 
 class DatasetWriteError(SectorlightError, OSError):
-    """The dataset's folder cannot be written: no permission, no space left, or a file in its place."""
+    """The dataset's folder, which took a file when the bake began, takes no more: no space left, or somebody else's folder inside it."""
 
     code = "dataset_write"
 
@@ -77,9 +80,10 @@ def _writing(path: Path, elsewhere: str = "choose another --output") -> Iterator
     try:
         yield
     except OSError as error:
+        remedy = "make room" if error.errno in NO_ROOM else "let it be written"
         raise DatasetWriteError(
             f"{error.filename or path}: {error.strerror or error}; finished sectors are kept: "
-            f"make room or {elsewhere}, and start the same bake again"
+            f"{remedy} or {elsewhere}, and start the same bake again"
         ) from error
 
 
@@ -125,8 +129,7 @@ def bake(
         settings = with_target_error(settings, target_error)
     if not 0 <= seed <= LARGEST_INTEGER:
         raise InputError(f"seed: expected a whole number of 0..{LARGEST_INTEGER}, found {seed}")
-    if output.exists() and not output.is_dir():
-        raise InputError(f"--output {output}: expected a folder, found a file")
+    expect_folder(output, "--output")
     scene = load_scene(source)
     for note in scene.notes:
         console.print(note, highlight=False, soft_wrap=True)

@@ -8,20 +8,19 @@ Only places in street air get one: nothing but ground below, open to the sky, cl
 """
 
 import argparse
-import json
 import re
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from bake_jobs.compare_points import EYE_HEIGHT_M, look_around, standing_eye
-from bake_jobs.geography import MapFrame, centre_of
+from bake_jobs.geography import MapFrame, centre_of, lonlat_of_geojson
 from bake_jobs.lamp_file import lamps_toml
 from bake_jobs.rays import RayScene
+from bake_jobs.table import read_json
 from gi_core.arrays import Bool, Float64
 from gi_core.constants import SECTOR_SIZE_M
 from gi_core.container import write_atomic
@@ -135,15 +134,14 @@ def _lamp(name: str, kind: str, place: Float64, turn: float) -> Lamp:
 
 def _points(path: Path) -> Float64:
     """Longitudes and latitudes (n, 2) of a GeoJSON's Point features."""
+    record = read_json(path, "a GeoJSON FeatureCollection with Point features")
     try:
-        record: Any = json.loads(path.read_text(encoding="utf-8"))
         shapes = [feature["geometry"] for feature in record["features"]]
         points = [shape["coordinates"][:2] for shape in shapes if shape and shape["type"] == "Point"]
-        lonlat = np.array(points, np.float64).reshape(-1, 2)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        found = np.array(points, np.float64).reshape(-1, 2)
+    except (ValueError, TypeError, KeyError) as error:
         raise InputError(f"{path}: expected a GeoJSON FeatureCollection with Point features ({error!r})") from error
+    lonlat = lonlat_of_geojson(found, record, str(path))
     if not len(lonlat) or not (np.abs(lonlat) <= (180, 90)).all():
         raise InputError(f"{path}: expected Point features with longitude and latitude, found {len(lonlat)}")
     return lonlat

@@ -1,5 +1,6 @@
-"""Reading one TOML table by name and type, with errors that say which table and key; keys nobody asked for are refused."""
+"""Reading one TOML table by name and type, with errors that say which table and key; keys nobody asked for are refused. And JSON."""
 
+import json
 import math
 import tomllib
 from collections.abc import Sequence
@@ -103,6 +104,19 @@ def read_toml(path: Path) -> Table:
         raise SourceError(f"{path}: expected TOML ({error})") from error
     except OSError as error:
         raise SourceError(f"{path}: cannot be read ({error.strerror})") from error
+
+
+def read_json(path: Path, what: str) -> dict[str, Any]:
+    """A file's one JSON object, which is to be ``what``. Raises SourceError when it cannot be read or is none."""
+    try:
+        document = json.loads(path.read_bytes())
+    except (ValueError, RecursionError) as error:
+        raise SourceError(f"{path}: expected {what}, found no valid JSON ({error})") from error
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be read ({error.strerror})") from error
+    if not isinstance(document, dict):
+        raise SourceError(f"{path}: expected {what}, found a {type(document).__name__}")
+    return document
 
 
 def _is_number(value: Any) -> bool:

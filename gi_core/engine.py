@@ -128,12 +128,12 @@ class Engine:
         lighting = make_lighting(self.dataset.world.location, time, weather)
         return lighting if self.sky is None else lighting_with_sky(lighting, self.sky)
 
-    def lit_sector(self, index: SectorIndex, lighting: Lighting, settings: Settings = NEUTRAL) -> Float32:
+    def lit_sector(self, index: SectorIndex, lighting: Lighting) -> Float32:
         """The light of a sector's probes (P, B, 3) float32 [lx], in the dataset's basis, bounces converged to relight.QUERY_RESIDUAL.
 
         Raises SectorMissingError, CorruptFileError.
         """
-        return self._lit_sector(index, self._light(lighting, settings)).cubes
+        return self._lit_sector(index, self._light(lighting, NEUTRAL)).cubes
 
     def _light(self, lighting: Lighting, settings: Settings) -> _Light:
         """What a query is lit by, worked out once for all its sectors."""

@@ -42,18 +42,18 @@ class Row:
     of_mean: list[int]
 
 
-def lamp_move_table(dataset: Dataset, position: Float64, lamps: int, moves: int, device: str | None = None) -> list[Row]:
+def lamp_move_table(dataset: Dataset, position: Float64, lamps: int, moves: int) -> list[Row]:
     """A row for each of PLACES, the same lamps and moves in all.
 
     Raises OutsideWorldError for a position (3,) [m] beyond the dataset, InputError where its volume has no street, CorruptFileError.
     """
-    engine = Engine(dataset, device)
+    engine = Engine(dataset)
     lighting = engine.lighting(NIGHT, "clear")
     standing = street_lamps(engine.volume(position, lighting), lamps)
     player = TickPlayers(("one",), position[None], np.zeros((1, 3)))
     rows = []
     for places in PLACES:
-        world, now, tick, row = LiveWorld(dataset, device, shadow_map=False, places=places), standing, 0, Row(places, [], [])
+        world, now, tick, row = LiveWorld(dataset, shadow_map=False, places=places), standing, 0, Row(places, [], [])
         try:
             for number in range(moves):
                 tick = settle(world, tick, player, live_light(world, lighting, now, standing=True))

@@ -67,9 +67,9 @@ def decode_root(codes: AnyArray) -> Float32:
     return root * root
 
 
-def encode_signed_root(values: AnyArray, step: int = 1) -> Int8:
-    """-1..1 -> int8, sign and square root of the magnitude. Of codes in whole ``step``s there are fewer, and they compress better."""
-    return (np.sign(values) * np.rint(np.sqrt(np.clip(np.abs(values), 0, 1)) * (127 // step)) * step).astype(np.int8)
+def encode_signed_root(values: AnyArray) -> Int8:
+    """-1..1 -> int8, sign and square root of the magnitude."""
+    return (np.sign(values) * np.rint(np.sqrt(np.clip(np.abs(values), 0, 1)) * 127)).astype(np.int8)
 
 
 def decode_signed_root(codes: AnyArray) -> Float32:

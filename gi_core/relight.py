@@ -83,8 +83,8 @@ class Relighter:
             lane.flush()
         return [lanes[place % len(lanes)] for place in range(len(residents))]
 
-    def converge(self, resident: ResidentSector, given: RelightInput, residual: float = QUERY_RESIDUAL) -> Converged:
-        """Relight a sector from darkness until what later bounces could still add is below ``residual`` times the peak.
+    def converge(self, resident: ResidentSector, given: RelightInput) -> Converged:
+        """Relight a sector from darkness until what later bounces could still add is below QUERY_RESIDUAL times the peak.
 
         The remaining distance is estimated from how fast the change shrinks: change * rate / (1 - rate), as for any contraction. Where
         MAX_PASSES were not enough the light is returned as it is, and the log tells so, once for a sector.
@@ -109,15 +109,15 @@ class Relighter:
                 return Converged(after, first, 0.0, passes)
             rate = min((change / last_change) ** (1 / _PASSES_PER_LOOK), slowest) if last_change else slowest
             left, last_change = change * rate / (1 - rate) / peak, change
-            if left <= residual:
+            if left <= QUERY_RESIDUAL:
                 break
-        if left > residual and sector.index not in self._told_of:
+        if left > QUERY_RESIDUAL and sector.index not in self._told_of:
             self._told_of.add(sector.index)
             log.warning(
                 "sector %s: bounces given up after %d passes, %.1e of the brightest value from their fixed point; expected %.1e",
                 f"{sector.index.x},{sector.index.z}",
                 passes,
                 left,
-                residual,
+                QUERY_RESIDUAL,
             )
         return Converged(after, first, left, passes)

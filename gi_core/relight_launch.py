@@ -1,6 +1,6 @@
 """How a relight's kernels are launched over a resident sector: all in one launch on a processor, one for each phase elsewhere."""
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pyopencl as cl
@@ -43,16 +43,26 @@ def _defines(resident: "ResidentSector", task: RelightTask) -> tuple[dict[str, i
     return sun, bricks, {"BASIS_SIZE": resident.sector.basis_size}
 
 
+def _surfels(r: "ResidentSector") -> tuple[Any, ...]:
+    """What kernels read of a sector's surfels to find the sun on them."""
+    return np.uint32(r.groups), r.surfel_normal, r.sun_visibility, np.uint32(r.plane_bytes), r.sun_sample, r.sun_share
+
+
+def _factors(r: "ResidentSector") -> tuple[cl.Buffer, ...]:
+    """What kernels gather probes by."""
+    return r.factor_starts, r.sky_starts, r.factor_source, r.factor_code, r.factor_scale
+
+
 def _launch_in_one(resident: "ResidentSector", task: RelightTask, queue: cl.CommandQueue) -> None:
     r, sector, light = resident, resident.sector, task.light
     sun, bricks, basis = _defines(resident, task)
     r.device.shared_kernel("relight_sector", **(sun | bricks | basis)).launch(
         (1,),
         (1,),
-        *(np.uint32(r.groups), r.surfel_normal, r.sun_visibility, np.uint32(r.plane_bytes), r.sun_sample, r.sun_share),
+        *_surfels(r),
         *(np.uint32(sector.brick_count), r.direct, task.glow, r.brick_starts, r.surfel_albedo, np.float32(task.snow)),
         *(np.uint32(r.sky_patches), task.bounce_starts, r.bounces, r.brick_basis, r.exitance),
-        *(np.uint32(sector.probe_count), r.factor_starts, r.sky_starts, r.factor_source, r.factor_code, r.factor_scale, task.cubes),
+        *(np.uint32(sector.probe_count), *_factors(r), task.cubes),
         *(light.lights, light.patches),
         queue=queue,
         offset=(2 * task.passes + task.is_lit_anew,),
@@ -65,14 +75,12 @@ def _launch_by_phase(resident: "ResidentSector", task: RelightTask, queue: cl.Co
     brick_count, probe_count, stride = np.uint32(sector.brick_count), np.uint32(sector.probe_count), np.uint32(r.groups * SURFELS_PER_GROUP)
     if task.is_lit_anew and sector.brick_count:
         if len(light.given.lights):
-            surfels = (np.uint32(r.groups), r.surfel_normal, r.sun_visibility, np.uint32(r.plane_bytes), r.sun_sample, r.sun_share)
-            shared("sun_on_surfels", **sun).launch_1d(r.groups, *surfels, light.lights, queue=queue)
+            shared("sun_on_surfels", **sun).launch_1d(r.groups, *_surfels(r), light.lights, queue=queue)
         lit = (brick_count, r.direct, task.glow, r.brick_starts, r.surfel_albedo, r.sun_share, stride, np.float32(task.snow))
         shared("light_bricks", **bricks).launch_1d(sector.brick_count, *lit, light.lights, queue=queue)
     bounce, gather = shared("bounce_bricks", **basis), shared("gather_probes", **basis)
     bounced = (task.bounce_starts, r.bounces, r.direct, task.cubes, r.brick_basis, r.exitance)
-    factors = (r.factor_starts, r.sky_starts, r.factor_source, r.factor_code, r.factor_scale)
     for _ in range(task.passes):
         items = sector.brick_count + r.sky_patches
         bounce.launch_1d(items, brick_count, np.uint32(r.sky_patches), *bounced, light.patches, queue=queue)
-        gather.launch_1d(sector.probe_count, probe_count, *factors, r.exitance, task.cubes, queue=queue)
+        gather.launch_1d(sector.probe_count, probe_count, *_factors(r), r.exitance, task.cubes, queue=queue)

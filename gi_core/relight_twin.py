@@ -15,6 +15,8 @@ from gi_core.layout import NO_SAMPLE, WHOLE_SAMPLE
 from gi_core.relight_input import RelightInput
 from gi_core.sector import Sector, counts
 
+MOST_PASSES = 10_000
+
 
 def sun_bits(sector: Sector, plane: int) -> AnyArray:
     """(S,) uint8: the visibility bits of one plane."""
@@ -113,7 +115,6 @@ def relight(
     given: RelightInput,
     cubes: AnyArray,
     passes: int,
-    dtype: Any = np.float32,
     lamps: AnyArray | None = None,
     sun_sample: UInt8 | None = None,
 ) -> AnyArray:
@@ -121,21 +122,18 @@ def relight(
 
     lamps : (S, 3) [lx] on each surfel; sun_sample : as ``directional_irradiance`` takes it
     """
-    direct = light_bricks(sector, given, lamps, dtype, sun_sample)
-    patches = given.patch_exitance.astype(dtype)
+    direct, patches = light_bricks(sector, given, lamps, sun_sample=sun_sample), given.patch_exitance.astype(np.float32)
     for _ in range(passes):
-        exitance = np.concatenate([brick_exitance(direct, bounce_bricks(sector, given, cubes, dtype)), patches])
-        cubes = gather_probes(sector, exitance, dtype)
+        exitance = np.concatenate([brick_exitance(direct, bounce_bricks(sector, given, cubes)), patches])
+        cubes = gather_probes(sector, exitance)
     return cubes
 
 
-def solve(
-    sector: Sector, given: RelightInput, tolerance: float = 1e-10, max_passes: int = 10_000, lamps: AnyArray | None = None
-) -> Float64:
+def solve(sector: Sector, given: RelightInput, tolerance: float = 1e-10, lamps: AnyArray | None = None) -> Float64:
     """The fixed point (P, B, 3) [lx] in float64: passes until none changes any value by more than tolerance times the peak."""
     cubes = np.zeros((sector.probe_count, sector.basis_size, 3))
     direct = light_bricks(sector, given, lamps, np.float64)
-    for _ in range(max_passes):
+    for _ in range(MOST_PASSES):
         bricks = brick_exitance(direct, bounce_bricks(sector, given, cubes, np.float64))
         after = gather_probes(sector, np.concatenate([bricks, given.patch_exitance.astype(np.float64)]), np.float64)
         change, cubes = np.abs(after - cubes).max(initial=0), after

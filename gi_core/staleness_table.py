@@ -64,15 +64,15 @@ class Row:
 LampsAt = Callable[[int], tuple[Lamp, ...]]
 
 
-def staleness_table(dataset: Dataset, position: Float64, device: str | None = None) -> list[Row]:
+def staleness_table(dataset: Dataset, position: Float64) -> list[Row]:
     """Rows for the clock at each of RATES, and for lamps that flicker, each with PLACES sectors in a tick.
 
     Raises OutsideWorldError for a position (3,) [m] beyond the dataset, CorruptFileError.
     """
-    engine = Engine(dataset, device)
+    engine = Engine(dataset)
     cases: list[tuple[str, str, float, LampsAt]] = [(f"clock, {rate:g} x", MORNING, rate, no_lamps) for rate in RATES]
     cases.append((f"{LAMPS} lamps, {FLICKER_HZ:g} Hz", NIGHT, 0.0, flickering(position)))
-    return [_row(name, engine, position, start, rate, lamps, places, device) for name, start, rate, lamps in cases for places in PLACES]
+    return [_row(name, engine, position, start, rate, lamps, places) for name, start, rate, lamps in cases for places in PLACES]
 
 
 def no_lamps(_: int) -> tuple[Lamp, ...]:
@@ -95,10 +95,10 @@ def flickering(position: Float64) -> LampsAt:
     return at
 
 
-def _row(moves: str, engine: Engine, position: Float64, start: str, rate: float, lamps_at: LampsAt, places: int, device: str | None) -> Row:
+def _row(moves: str, engine: Engine, position: Float64, start: str, rate: float, lamps_at: LampsAt, places: int) -> Row:
     dataset = engine.dataset
     begin, clear = parse_time(start, dataset.world.location), parse_weather("clear")
-    world = LiveWorld(dataset, device, shadow_map=False, places=max(places, 2))
+    world = LiveWorld(dataset, shadow_map=False, places=max(places, 2))
     with ThreadPoolExecutor(1) as worker:
         track = LightTrack(dataset.world.location, worker)
         track.set_weather(lambda _: clear)

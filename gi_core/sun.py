@@ -39,10 +39,9 @@ class SkyPosition:
 
 @dataclass(frozen=True)
 class MoonPosition(SkyPosition):
-    """The moon also has a phase angle [degrees] (0 full, 180 new) and an illuminated fraction 0..1."""
+    """The moon also has a phase angle [degrees], 0 full, 180 new."""
 
     phase_angle_degrees: float
-    illuminated_fraction: float
 
 
 def refraction_degrees(true_elevation_degrees: float, pressure_mbar: float, temperature_c: float) -> float:
@@ -79,20 +78,17 @@ def sun_position(
     return SkyPosition(math.degrees(sun.az), true, true + lift, float(sun.earth_distance))
 
 
-def moon_position(
-    location: Location, time: datetime, pressure_mbar: float | None = None, temperature_c: float = STANDARD_TEMPERATURE_C
-) -> MoonPosition:
-    """The moon over a location at an aware time. Its parallax (a degree) is included."""
+def moon_position(location: Location, time: datetime) -> MoonPosition:
+    """The moon over a location at an aware time, in air of the mean pressure at its elevation. Its parallax (a degree) is included."""
     observer = _observer(location, time)
     sun, moon = ephem.Sun(observer), ephem.Moon(observer)
     true = math.degrees(moon.alt)
-    lift = refraction_degrees(true, pressure_at(location.elevation_m) if pressure_mbar is None else pressure_mbar, temperature_c)
+    lift = refraction_degrees(true, pressure_at(location.elevation_m), STANDARD_TEMPERATURE_C)
     # Meeus, "Astronomical Algorithms", 48.3; atan2 keeps it exact near full and new moon.
     elongation = float(ephem.separation(sun, moon))
     sun_distance, distance = float(sun.earth_distance), float(moon.earth_distance)
     phase_angle = math.atan2(sun_distance * math.sin(elongation), distance - sun_distance * math.cos(elongation))
-    fraction = (1 + math.cos(phase_angle)) / 2
-    return MoonPosition(math.degrees(moon.az), true, true + lift, distance, math.degrees(phase_angle), fraction)
+    return MoonPosition(math.degrees(moon.az), true, true + lift, distance, math.degrees(phase_angle))
 
 
 def _observer(location: Location, time: datetime) -> ephem.Observer:

@@ -31,22 +31,20 @@ def has_current(request: Request, etag: str) -> bool:
     return names(request.headers, etag)
 
 
-def conditional(
-    request: Request, etag: str, compute: Callable[[], Body], cache_control: str = QUERY_CACHE_CONTROL, laps: Laps | None = None
-) -> Response:
+def conditional(request: Request, etag: str, compute: Callable[[], Body], laps: Laps | None = None) -> Response:
     """304 when the client has the reply already, else the reply: a finished one, or what ``compute`` returns.
 
     ``*`` in If-None-Match means any successful reply. A reply that is computed says what took how long: ``laps``, or all of it as one.
     """
     if has_current(request, etag):
-        return Response(status_code=304, headers={"ETag": etag, "Cache-Control": cache_control})
+        return Response(status_code=304, headers={"ETag": etag, "Cache-Control": QUERY_CACHE_CONTROL})
     replies = service_of(request).replies
     reply, laps = replies.get(etag), laps or Laps()
     is_new = reply is None
     if reply is None:
         replies.count_miss()
         with laps.unless_divided("compute"):
-            reply = FinishedReply(etag, cache_control, compute())
+            reply = FinishedReply(etag, QUERY_CACHE_CONTROL, compute())
     replies.keep(target_of(request.scope), reply)
     answer = reply.answer(request.headers)
     return laps.told(answer) if is_new and answer.status_code == 200 else answer

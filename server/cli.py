@@ -122,8 +122,6 @@ def bake(
     ] = None,
 ) -> None:
     """Bake a city into a dataset. Interrupted with Ctrl-C, it keeps the sectors that are finished, and the same command bakes the rest."""
-    if output.exists() and not output.is_dir():
-        raise InputError(f"--output {output}: expected a folder, or a name for a new one; found a file")
     chosen = None if sectors is None else parse_sectors(sectors)
     try:
         from bake_jobs.runner import bake as run
@@ -263,10 +261,11 @@ def bench(
     import server.bench
     import server.bench_pack
     from bake_jobs.runner import bake as run_bake
+    from gi_core.outputs import expect_file
     from server import cli_bench
 
     if json_path is not None:
-        cli_bench.check_output(json_path)
+        expect_file(json_path, "--json")
     try:
         with writing(json_path), Console(stderr=True).status("relight, volume, decode") as status:
             measured = gi_core.bench.run(device, quick)

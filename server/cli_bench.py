@@ -9,15 +9,8 @@ from rich.table import Table
 
 from gi_core.bench import Measurement
 from gi_core.container import write_atomic
-from gi_core.errors import InputError
 
 TABLE_WIDTH = 160  # where no terminal says how wide it is
-
-
-def check_output(path: Path, flag: str = "--json") -> None:
-    """InputError unless a file can be made there: said before minutes of measuring, not after."""
-    if path.is_dir() or not path.absolute().parent.is_dir():
-        raise InputError(f"{flag} {path}: expected a file in a folder that exists")
 
 
 def show(measurements: Sequence[Measurement]) -> None:

@@ -4,6 +4,7 @@ Bounds here only keep arithmetic finite and work small; whether a place or a wea
 """
 
 import math
+from collections import Counter
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -212,10 +213,10 @@ class NoQuery(StrictQuery):
 # Dependencies are coroutines though they wait for nothing: plain functions are called in a thread of the pool, which may be long in coming.
 async def refuse_repeated_parameters(request: HTTPConnection) -> None:
     """InputError when a parameter is given twice: either value may be the one that was meant."""
-    names = [name for name, _ in request.query_params.multi_items()]
-    repeated = sorted({name for name in names if names.count(name) > 1})
-    if repeated:
-        raise InputError(f"query: expected each parameter once, found {repeated[0][:40]} more than once")
+    counts = Counter(name for name, _ in request.query_params.multi_items())
+    repeated = min((name for name, count in counts.items() if count > 1), default=None)
+    if repeated is not None:
+        raise InputError(f"query: expected each parameter once, found {repeated[:40]} more than once")
 
 
 def service_of(request: HTTPConnection) -> Service:

@@ -15,6 +15,8 @@ from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 MAX_BYTES = 64 << 20  # some 80 raw volumes
+# A reply takes 1.4 kB beside its content: without this a million of the smallest would fit, and be held in a gigabyte and a half.
+MAX_REPLIES = 8192
 # Longer targets are somebody's experiment; remembering them would cost more than it saves.
 MAX_TARGET_BYTES = 512
 MAX_TARGETS = 4096
@@ -61,7 +63,7 @@ def names(headers: Mapping[str, str], etag: str) -> bool:
 
 
 class FinishedReplies:
-    """The replies that were asked for last, bounded in bytes. Safe to use from several threads."""
+    """The replies that were asked for last, bounded in bytes and in number. Safe to use from several threads."""
 
     def __init__(self, max_bytes: int = MAX_BYTES) -> None:
         self.hits = self.misses = 0
@@ -87,7 +89,7 @@ class FinishedReplies:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the replies that are kept."""
+        """Bytes of the contents that are kept."""
         return self._bytes
 
     def at(self, target: Target) -> FinishedReply | None:
@@ -106,7 +108,7 @@ class FinishedReplies:
                 self._bytes += size
             self._replies[reply.etag] = reply
             self._replies.move_to_end(reply.etag)
-            while self._bytes > self._max_bytes:
+            while self._bytes > self._max_bytes or len(self._replies) > MAX_REPLIES:
                 _, oldest = self._replies.popitem(last=False)
                 self._bytes -= len(oldest.body.content)
             if len(target[0]) + len(target[1]) <= MAX_TARGET_BYTES:

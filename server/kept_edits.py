@@ -1,7 +1,6 @@
 """Live edits that asked to be kept: players, lamps and boxes in a JSON file, written whole after each change, read at the next start."""
 
 import json
-import os
 import threading
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -9,6 +8,7 @@ from pathlib import Path
 
 from gi_core.container import write_atomic
 from gi_core.errors import InputError
+from gi_core.outputs import expect_file
 from server.boxes_json import box_from_json, box_to_json
 from server.json_input import Members, read_text
 from server.lamps_json import lamp_from_json, lamp_to_json
@@ -33,8 +33,8 @@ class KeptEdits:
 
     def __init__(self, path: Path | None) -> None:
         """Raises InputError when nothing could be written there, rather than at the first edit."""
-        if path is not None and (path.is_dir() or not os.access(path.parent, os.W_OK)):
-            raise InputError(f"--state {path}: expected a file in a folder that exists and can be written to")
+        if path is not None:
+            expect_file(path, "--state")
         self._path = path
         self._lock = threading.Lock()
 

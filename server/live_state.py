@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any
+from typing import TypeVar
 
 from gi_core.errors import InputError, SectorlightError
 from gi_core.settings import NEUTRAL, Settings
@@ -113,13 +113,7 @@ class LiveState:
 
     def with_lamp(self, lamp: LiveLamp, new: bool) -> "LiveState":
         """Another lamp, or one changed. Raises TakenIdError, NoSuchThingError, and InputError when there are too many."""
-        if new and lamp.id in self.lamps:
-            raise TakenIdError(f"light {lamp.id!r}: expected a new id, found one in use; PATCH changes a light")
-        if not new and lamp.id not in self.lamps:
-            raise _missing(lamp.id, "light")
-        if len(self.lamps) >= MAX_LAMPS and new:
-            raise InputError(f"lights: expected at most {MAX_LAMPS}, found as many already")
-        return replace(self, lamps=MappingProxyType({**self.lamps, lamp.id: lamp}))
+        return replace(self, lamps=_with(self.lamps, lamp, "light", MAX_LAMPS, new))
 
     def without_lamp(self, name: str) -> "LiveState":
         """One lamp less. Raises NoSuchThingError."""
@@ -127,13 +121,7 @@ class LiveState:
 
     def with_box(self, box: LiveBox, new: bool) -> "LiveState":
         """Another box, or one changed. Raises TakenIdError, NoSuchThingError, and InputError when there are too many."""
-        if new and box.id in self.boxes:
-            raise TakenIdError(f"box {box.id!r}: expected a new id, found one in use; PATCH changes a box")
-        if not new and box.id not in self.boxes:
-            raise _missing(box.id, "box")
-        if len(self.boxes) >= MAX_BOXES and new:
-            raise InputError(f"boxes: expected at most {MAX_BOXES}, found as many already")
-        return replace(self, boxes=MappingProxyType({**self.boxes, box.id: box}))
+        return replace(self, boxes=_with(self.boxes, box, "box", MAX_BOXES, new))
 
     def without_box(self, name: str) -> "LiveState":
         """One box less. Raises NoSuchThingError."""
@@ -153,25 +141,21 @@ class LiveState:
 
     def lamp(self, name: str) -> LiveLamp:
         """A lamp by its id. Raises NoSuchThingError."""
-        if name not in self.lamps:
-            raise _missing(name, "light")
-        return self.lamps[name]
+        return _found(self.lamps, name, "light")
 
     def box(self, name: str) -> LiveBox:
         """A box by its id. Raises NoSuchThingError."""
-        if name not in self.boxes:
-            raise _missing(name, "box")
-        return self.boxes[name]
+        return _found(self.boxes, name, "box")
 
     def player(self, name: str) -> LivePlayer:
         """A player by its id. Raises NoSuchThingError."""
-        if name not in self.players:
-            raise _missing(name, "player")
-        return self.players[name]
+        return _found(self.players, name, "player")
 
 
 # From the state before a tick, and its number, to the state in that tick.
 Command = Callable[[LiveState, int], LiveState]
+Thing = TypeVar("Thing")
+Changeable = TypeVar("Changeable", LiveLamp, LiveBox)
 
 
 def authored_lamps(lamps: tuple[Lamp, ...]) -> Mapping[str, LiveLamp]:
@@ -186,11 +170,23 @@ def authored_lamps(lamps: tuple[Lamp, ...]) -> Mapping[str, LiveLamp]:
     return MappingProxyType(found)
 
 
-def _without(things: Mapping[str, Any], name: str, what: str) -> Mapping[str, Any]:
-    if name not in things:
-        raise _missing(name, what)
+def _with(things: Mapping[str, Changeable], thing: Changeable, what: str, most: int, new: bool) -> Mapping[str, Changeable]:
+    """Another thing, or one changed."""
+    if not new:
+        _found(things, thing.id, what)
+    elif thing.id in things:
+        raise TakenIdError(f"{what} {thing.id!r}: expected a new id, found one in use; PATCH changes a {what}")
+    elif len(things) >= most:
+        raise InputError(f"{what}: expected at most {most} of them, found as many already")
+    return MappingProxyType({**things, thing.id: thing})
+
+
+def _without(things: Mapping[str, Thing], name: str, what: str) -> Mapping[str, Thing]:
+    _found(things, name, what)
     return MappingProxyType({key: value for key, value in things.items() if key != name})
 
 
-def _missing(name: str, what: str) -> NoSuchThingError:
-    return NoSuchThingError(f"{what} {name[:64]!r}: expected the id of a {what} that is there, found none")
+def _found(things: Mapping[str, Thing], name: str, what: str) -> Thing:
+    if name not in things:
+        raise NoSuchThingError(f"{what} {name[:64]!r}: expected the id of a {what} that is there, found none")
+    return things[name]

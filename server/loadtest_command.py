@@ -13,8 +13,8 @@ from rich.text import Text
 
 from gi_core.container import write_atomic
 from gi_core.errors import InputError
+from gi_core.outputs import expect_file
 from server import loadtest_limits, loadtest_plot
-from server.cli_bench import check_output
 from server.loadtest import Options, Path3, run
 from server.loadtest_limits import Limits
 from server.loadtest_record import Recorder
@@ -60,7 +60,7 @@ def run_command(options: Options, limits: Limits, json_path: Path | None, plot_p
     """Run a test, show it, write it. Returns the limits it missed, a line each, and whether it was interrupted."""
     for flag, path in (("--json", json_path), ("--plot", plot_path)):
         if path is not None:
-            check_output(path, flag)
+            expect_file(path, flag)
     bar = Progress(
         TextColumn("{task.description}"),
         BarColumn(),

@@ -33,6 +33,7 @@ PING_S = 20.0
 ENCODERS = 2
 # For the last word to a client that may not be reading.
 CLOSE_S = 1.0
+MAX_REASON_BYTES = 123  # what a WebSocket's close frame has room for (RFC 6455, 5.5)
 
 
 class Close(NamedTuple):
@@ -101,7 +102,7 @@ class PlayerStreams:
                     self._ended.set()
 
     async def close(self) -> None:
-        """Tell every client that the server stops; returns once they know, or after a second."""
+        """Tell every client that the server stops; returns once they know, or after two seconds."""
         self._is_closed = True
         self._ended.clear()
         for told in self._closing:
@@ -215,6 +216,7 @@ async def _result(told: "asyncio.Future[Close]") -> Close:
 
 
 async def close(socket: WebSocket, ending: Close) -> None:
-    """End a stream with a word, if the client still takes it."""
+    """End a stream with a word, cut to what fits, if the client still takes it."""
+    reason = ending.reason.encode()[:MAX_REASON_BYTES].decode(errors="ignore")
     with contextlib.suppress(TimeoutError, WebSocketDisconnect, RuntimeError):
-        await asyncio.wait_for(socket.close(*ending), CLOSE_S)
+        await asyncio.wait_for(socket.close(ending.code, reason), CLOSE_S)

@@ -10,13 +10,10 @@ What a picture shows wrong is therefore wrong for clients as well.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
 from gi_core.arrays import Float32, Float64, Int32, Int64
-from gi_core.distant_file import DistantLight
 from gi_core.engine import Engine
 from gi_core.lighting import Lighting
 from gi_core.lights import lamps_on
@@ -27,42 +24,19 @@ from server.camera import Camera
 from server.preview_air import background, plain_distance, through_fog
 from server.preview_fog import add_fog_light
 from server.preview_lamps import draw_lamps, lamp_irradiance
-from server.preview_light import Beyond, ServedLight
+from server.preview_light import PLAIN_LOOK, Indirect, Look, ServedLight
 from server.preview_occlusion import kept_by_decals, kept_share
 from server.preview_scene import PreviewScene
 from server.raycast import RayCaster
 
-Indirect = Literal["on", "off", "split"]
-
 STRAIGHT_UP = np.array([0.0, 1.0, 0.0])
-
-
-@dataclass(frozen=True)
-class Look:
-    """What of the light a picture shows.
-
-    indirect : where indirect light is drawn; split: in the right half only
-    distant : what lies beyond the volumes; on: the distant texture, off: the nearest volume's edge, client: the texture beyond the one
-        volume around the eye
-    interior : whether rooms are lit by their interior volumes, or by the outdoor one
-    distant_light : what the distant texture knows: the sky alone, or all light; None is the best that was baked
-    """
-
-    indirect: Indirect = "on"
-    distant: Beyond = "on"
-    occlusion: bool = False
-    interior: bool = True
-    distant_light: DistantLight | None = None
-
-
-PLAIN_LOOK = Look()
 
 
 def city_radiance(
     engine: Engine, scene: PreviewScene, camera: Camera, lighting: Lighting, look: Look = PLAIN_LOOK, settings: Settings = NEUTRAL
 ) -> Float32:
     """``render`` with an engine's lamps and light, under the artists' settings. Raises as ``ServedLight.of``."""
-    served = ServedLight.of(engine, lighting, settings, look.distant, camera.eye, look.interior, look.distant_light)
+    served = ServedLight.of(engine, lighting, look, camera.eye, settings)
     lamps = settings.brightened(lamps_on(engine.lamps, lighting))
     return render(camera, scene, settings.light(lighting), lamps, served, look)
 

@@ -15,11 +15,10 @@ from gi_core.arrays import Float32, Float64, UInt8
 from gi_core.error_report import DARKEST_SHARE_OF_MEAN
 from gi_core.lighting import Lighting
 from gi_core.lights import lamps_on
-from gi_core.settings import NEUTRAL
 from gi_core.spectrum import LUMINANCE_FROM_RGB
 from server.camera import Camera
-from server.preview import Look, indirect_irradiance
-from server.preview_light import ServedLight
+from server.preview import indirect_irradiance
+from server.preview_light import Look, ServedLight
 from server.preview_scene import PreviewScenes
 from server.service import Service
 
@@ -42,7 +41,7 @@ def error_picture(service: Service, camera: Camera, lighting: Lighting, look: Lo
         hit = np.flatnonzero(surface.hit)
         if len(hit):
             position, normal = surface.position[hit], surface.normal[hit]
-            light = ServedLight.of(service.engine, lighting, NEUTRAL, look.distant, camera.eye, look.interior, look.distant_light)
+            light = ServedLight.of(service.engine, lighting, look, camera.eye)
             served = indirect_irradiance(scene.rays, light, look, position, normal) @ LUMINANCE_FROM_RGB
             error[hit] = relative_error(served, _traced(service, camera, lighting, position, normal))
     picture = Image.fromarray(false_colour(error.reshape(coarse.height, coarse.width)))

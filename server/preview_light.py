@@ -23,10 +23,11 @@ from gi_core.engine import Distant, Engine
 from gi_core.errors import InputError
 from gi_core.lighting import Lighting
 from gi_core.rooms import light_shares
-from gi_core.settings import Settings
+from gi_core.settings import NEUTRAL, Settings
 from gi_core.volume import Volume, sample_coefficients, sample_volume
 from gi_core.world import Decal, Room
 
+Indirect = Literal["on", "off", "split"]
 Beyond = Literal["on", "off", "client"]
 # The served volume around a place, of the room that a number says; 0 is outdoors.
 VolumeAt = Callable[[Float64, int], Volume]
@@ -50,6 +51,28 @@ TILES_AT_ONCE = 1 << 12
 FADE_M = 25.0
 
 
+@dataclass(frozen=True)
+class Look:
+    """What of the light a picture shows.
+
+    indirect : where indirect light is drawn; split: in the right half only
+    distant : what lies beyond the volumes; on: the distant texture, off: the nearest volume's edge, client: the texture beyond the one
+        volume around the eye
+    occlusion : whether what stands near, and decals, dim it
+    interior : whether rooms are lit by their interior volumes, or by the outdoor one
+    distant_light : what the distant texture knows: the sky alone, or all light; None is the best that was baked
+    """
+
+    indirect: Indirect = "on"
+    distant: Beyond = "on"
+    occlusion: bool = False
+    interior: bool = True
+    distant_light: DistantLight | None = None
+
+
+PLAIN_LOOK = Look()
+
+
 @dataclass(frozen=True, eq=False)
 class ServedLight:
     """All that a picture knows of indirect light.
@@ -68,18 +91,9 @@ class ServedLight:
     decals: tuple[Decal, ...] = ()
 
     @classmethod
-    def of(
-        cls,
-        engine: Engine,
-        lighting: Lighting,
-        settings: Settings,
-        beyond: Beyond,
-        eye: Float64,
-        interior: bool = True,
-        distant_light: DistantLight | None = None,
-    ) -> "ServedLight":
-        """An engine's light under the artists' settings, seen from an eye (3,) [m]. Without ``interior`` volumes rooms are lit by the
-        outdoor one; None of ``distant_light`` is the best that was baked. Raises InputError for one that was not, CorruptFileError."""
+    def of(cls, engine: Engine, lighting: Lighting, look: Look, eye: Float64, settings: Settings = NEUTRAL) -> "ServedLight":
+        """An engine's light under the artists' settings, as a look has it, seen from an eye (3,) [m]. Raises InputError for a distant light
+        that was not baked, CorruptFileError."""
         low, high = engine.dataset.world.bounds
 
         def volume_at(position: Float64, room: int) -> Volume:
@@ -90,9 +104,9 @@ class ServedLight:
             except InputError:  # a closet between voxels, or out of the one volume's reach
                 return engine.volume(inside, lighting, settings)
 
-        distant = None if beyond == "off" else engine.distant(settings.light(lighting), distant_light)
+        distant = None if look.distant == "off" else engine.distant(settings.light(lighting), look.distant_light)
         world = engine.dataset.world
-        return cls(volume_at, distant, eye if beyond == "client" else None, world.rooms if interior else (), world.decals)
+        return cls(volume_at, distant, eye if look.distant == "client" else None, world.rooms if look.interior else (), world.decals)
 
     def irradiance(self, position: Float64, normal: Float32) -> Float32:
         """(n, 3) [lx] on surface points (n, 3) [m] with normals (n, 3), as a client samples it."""

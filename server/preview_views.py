@@ -13,13 +13,12 @@ from gi_core.constants import ROOM_OUTDOORS, SECTOR_SIZE_M, VOXEL_INDOORS, VOXEL
 from gi_core.engine import Engine, LitProbes
 from gi_core.errors import OutsideWorldError
 from gi_core.lighting import Lighting
-from gi_core.settings import NEUTRAL
 from gi_core.snow import snow_attribute
 from server import tonemap
 from server.camera import Camera
 from server.labels import with_key
-from server.preview import STRAIGHT_UP, Look, city_radiance
-from server.preview_light import SAMPLE_OFFSET_M, ServedLight, plan_volumes
+from server.preview import STRAIGHT_UP, city_radiance
+from server.preview_light import SAMPLE_OFFSET_M, Look, ServedLight, plan_volumes
 from server.preview_scene import PreviewScene
 from server.raycast import Surface
 
@@ -127,7 +126,7 @@ def sectors(seen: Seen) -> UInt8:
 
 def voxels(seen: Seen) -> UInt8:
     """The class of the voxel that a client reads first: the one a quarter voxel in front of the surface. Solid ones hold filled light."""
-    served = ServedLight.of(seen.engine, seen.lighting, NEUTRAL, "off", seen.camera.eye)
+    served = ServedLight.of(seen.engine, seen.lighting, Look(distant="off"), seen.camera.eye)
     points = seen.position + SAMPLE_OFFSET_M * seen.normal
     classes = np.full(len(points), VOXEL_NO_SECTOR, np.uint8)
     if len(points):
@@ -145,7 +144,7 @@ def voxels(seen: Seen) -> UInt8:
 
 def probes(seen: Seen) -> UInt8:
     """The lit picture, and probes within PROBE_REACH_M as spheres that show their light on all sides."""
-    radiance = city_radiance(seen.engine, seen.scene, seen.camera, seen.lighting, Look())
+    radiance = city_radiance(seen.engine, seen.scene, seen.camera, seen.lighting)
     ev100 = tonemap.metered(radiance, seen.lighting.exposure)
     found = near_probes(seen)
     if found is not None:

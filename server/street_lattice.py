@@ -30,12 +30,14 @@ class StreetLattice:
     @property
     def sectors_read(self) -> int:
         """How many files have been read."""
-        return sum(columns.was_read for columns in self._sectors.values())
+        return len(self._sectors)
 
     def level(self, x: int, z: int) -> int | None:
         """Lattice index y of the air that one stands in, in a column; None where nobody can."""
         key = (2 * x + 1) * _NUMERATOR // _DENOMINATOR, (2 * z + 1) * _NUMERATOR // _DENOMINATOR
         columns = self._sectors.get(key) or self._read(key)
+        if columns is None:
+            return None
         level = columns.levels[(z - columns.first_z) * columns.width + x - columns.first_x]
         return None if level == _NO_STREET else level
 
@@ -47,11 +49,16 @@ class StreetLattice:
     def columns_of(self, index: SectorIndex) -> list[tuple[int, int]]:
         """Columns (x, z) of a sector where one can stand on its lowest ground, so that no roof is among them."""
         columns = self._sectors.get(index) or self._read(index)
+        if columns is None:
+            return []
         lowest = min((level for level in columns.levels if level != _NO_STREET), default=_NO_STREET + 1)
         at = [i for i, level in enumerate(columns.levels) if level == lowest]
         return [(columns.first_x + i % columns.width, columns.first_z + i // columns.width) for i in at]
 
-    def _read(self, key: tuple[int, int]) -> "_Columns":
+    def _read(self, key: tuple[int, int]) -> "_Columns | None":
+        """None where no sector was baked: of those there is no end, and nothing of them is kept."""
+        if key not in self._dataset.world.sectors:
+            return None
         with self._lock:
             if key not in self._sectors:
                 self._sectors[key] = _Columns(self._dataset, SectorIndex(*key))
@@ -64,11 +71,10 @@ class _Columns:
     def __init__(self, dataset: Dataset, index: SectorIndex) -> None:
         (self.first_x, end_x), (self.first_z, end_z) = voxel_columns(index.x), voxel_columns(index.z)
         self.width = end_x - self.first_x
-        self.was_read = index in dataset.world.sectors
         shape = (end_z - self.first_z, self.width)
         # Who streams the sector reports a damaged file; nobody walks there.
         try:
-            levels = _levels(dataset, index, shape) if self.was_read else None
+            levels: list[int] | None = _levels(dataset, index, shape)
         except (FormatError, OSError):
             levels = None
         self.levels = array("i", [_NO_STREET] * (shape[0] * shape[1]) if levels is None else levels)

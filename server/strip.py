@@ -16,6 +16,7 @@ from gi_core.container import write_atomic
 from gi_core.dataset import Dataset
 from gi_core.engine import Engine
 from gi_core.errors import InputError
+from gi_core.outputs import expect_file
 from gi_core.settings import NEUTRAL, Settings
 from gi_core.settings_table import EXAMPLES
 from gi_core.weather import weather_presets
@@ -114,8 +115,7 @@ def run(dataset: Path, camera: Camera, kind: str, time: str, weather: str, outpu
     """Draw a sheet of a dataset into a file. Raises InputError, and what opening a dataset and a device does."""
     if kind not in KINDS:
         raise InputError(f"--kind {kind[:40]}: expected {' or '.join(KINDS)}")
-    if output.is_dir() or not output.absolute().parent.is_dir():
-        raise InputError(f"--output {output}: expected a file in a folder that exists")
+    expect_file(output, "--output")
     opened = Dataset.open(dataset)
     engine = Engine(opened, device)
     frames = plan_frames(kind, time, weather, bool(engine.lamps))

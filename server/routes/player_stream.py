@@ -18,7 +18,7 @@ async def stream(socket: WebSocket) -> None:
         ticker = await running_ticker(service, WRITES_WAIT_S)
         await service.streams.serve(socket, ticker, socket.path_params["id"])
     except SectorlightError as error:
-        await close(socket, Close(1013, service.public(str(error))[:100]))
+        await close(socket, Close(1013, service.public(str(error))))
     except WebSocketDisconnect:
         pass
 

@@ -13,8 +13,9 @@ from server.camera import Camera
 from server.dependencies import PreviewQuery, ServiceDep, parse_vector
 from server.encoding import REPLY_VERSION
 from server.openapi import NOT_CHANGED, reply
-from server.preview import Look, city_radiance
+from server.preview import city_radiance
 from server.preview_error import error_picture
+from server.preview_light import Look
 from server.service import Service
 
 router = APIRouter(prefix="/v1", tags=["pictures"])

@@ -1,6 +1,7 @@
 """The path tracer against scenes whose irradiance can be written down."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import pytest
@@ -200,7 +201,7 @@ def test_far_from_the_origin_it_is_the_same():
 
 def test_sh2_of_a_half_bright_sphere():
     empty = PathTracer(np.zeros((0, 3)), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32))
-    sh = empty.sh2_irradiance(np.zeros((1, 3)), lighting(sky=TINT), samples=16384)
+    sh = empty.projected_irradiance(np.zeros((1, 3)), lighting(sky=TINT), (), partial(projection_weights, "sh2"), samples=16384)
     truth = np.zeros(9)
     truth[0] = np.pi * 2 * np.pi * np.sqrt(1 / (4 * np.pi))
     truth[1] = 2 * np.pi / 3 * np.pi * np.sqrt(3 / (4 * np.pi))

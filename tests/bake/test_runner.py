@@ -1,6 +1,7 @@
 """The bake as a whole: the same bytes however it is run, and nothing lost when it is cut off."""
 
 import dataclasses
+import errno
 import os
 import resource
 import signal
@@ -211,17 +212,23 @@ def test_wrong_input_is_refused_before_anything_is_written(tmp_path):
     assert not target.exists()
 
 
-def test_an_output_that_is_a_file_is_the_users_mistake(source, tmp_path):
-    (tmp_path / "out").write_text("a letter")
-    with pytest.raises(InputError, match="expected a folder, found a file"):
-        run(source, tmp_path / "out")
-    assert (tmp_path / "out").read_text() == "a letter"
+def test_an_output_that_cannot_be_made_is_the_users_mistake_and_said_before_the_source_is_read(tmp_path):
+    (tmp_path / "file").write_text("a letter")
+    for name in ("file", "file/out"):
+        with pytest.raises(InputError, match=rf"--output .*/{name}: expected a folder"):
+            run(tmp_path / "absent.obj", tmp_path / name)
+    assert (tmp_path / "file").read_text() == "a letter"
 
 
-def test_an_output_that_cannot_be_made_is_one_clear_error(source, tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(DatasetWriteError, match=r"file/out.*Not a directory.*--output"):
-        run(source, tmp_path / "file" / "out")
+def test_only_a_full_disk_is_told_to_make_room(source, tmp_path, monkeypatch):
+    for number, remedy in ((errno.EACCES, "let it be written or choose another --output"), (errno.ENOSPC, "make room or choose")):
+
+        def refuse(*_, number=number, **__):
+            raise OSError(number, os.strerror(number), str(tmp_path / "out"))
+
+        monkeypatch.setattr(Path, "mkdir", refuse)
+        with pytest.raises(DatasetWriteError, match=rf"/out: {os.strerror(number)}; finished sectors are kept: {remedy}"):
+            run(source, tmp_path / "out")
 
 
 def command(source, output, *options, **popen):

@@ -133,9 +133,10 @@ def test_the_highest_level_of_detail_is_read(tmp_path):
     assert built(load(tmp_path, content)).sum() == 4
 
 
-def test_a_coordinate_system_gives_a_place_and_true_metres(tmp_path):
+@pytest.mark.parametrize("system", ["https://www.opengis.net/def/crs/EPSG/0/7415", "urn:ogc:def:crs,crs:EPSG::28992,crs:EPSG::5709"])
+def test_a_coordinate_system_gives_a_place_and_true_metres(tmp_path, system):
     content = document()
-    content["metadata"] = {"referenceSystem": "https://www.opengis.net/def/crs/EPSG/0/7415"}
+    content["metadata"] = {"referenceSystem": system}
     content["transform"]["translate"] = [155_000.0, 463_000.0, 0.0]  # the origin of the Dutch grid: Amersfoort's church tower
     scene = load(tmp_path, content, "a.cityjson")
     assert scene.location.latitude_degrees == pytest.approx(52.1552, abs=2e-4)
@@ -161,6 +162,7 @@ def broken():
         "geometry of text": (with_change(lambda d: d["CityObjects"]["house"]["geometry"][0].update(boundaries=5)), "house"),
         "only bad indices": (with_change(lambda d: d.update(vertices=d["vertices"][:1])), "found none"),
         "unknown system": (with_change(lambda d: d.update(metadata={"referenceSystem": "https://x/EPSG/0/999999"})), "PROJ"),
+        "a system of nobody's": (with_change(lambda d: d.update(metadata={"referenceSystem": "ours"})), "referenceSystem: .*'ours'"),
     }
 
 

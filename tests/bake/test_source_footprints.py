@@ -187,6 +187,70 @@ def test_the_projection_keeps_distances_from_the_origin():
     assert z == pytest.approx(-1853.4, abs=0.2)
 
 
+def named_crs(name):
+    return {"type": "name", "properties": {"name": name}}
+
+
+def write_in(path, features, crs, place=lambda lonlat: lonlat):
+    """Features with their positions put elsewhere, and a crs member that says where."""
+    moved = json.loads(json.dumps(features))
+    for feature in moved:
+        feature["geometry"]["coordinates"] = [place(np.array(ring)).tolist() for ring in feature["geometry"]["coordinates"]]
+    path.write_text(json.dumps({"type": "FeatureCollection", "crs": crs, "features": moved}))
+    return path
+
+
+TWO = [square(-100, 0, 20, base=5.0, height=30.0), square(100, 40, 20, base=5.0, height=12.0)]
+MERCATOR_RADIUS_M = 6_378_137.0
+
+
+def web_mercator(lonlat):
+    """EPSG:3857's easting and northing (Snyder, Map Projections: A Working Manual, 1987, eq. 7-1 and 7-2)."""
+    east, north = np.radians(lonlat).T
+    return MERCATOR_RADIUS_M * np.stack([east, np.log(np.tan(np.pi / 4 + north / 2))], axis=1)
+
+
+@pytest.mark.parametrize("name", ["EPSG:3857", "urn:ogc:def:crs:EPSG::3857", "http://www.opengis.net/def/crs/EPSG/0/3857"])
+def test_positions_are_in_the_system_that_the_file_names(tmp_path, name):
+    expected = load_footprints(write(tmp_path / "plain.geojson", *TWO))
+    found = load_footprints(write_in(tmp_path / "mercator.geojson", TWO, named_crs(name), web_mercator))
+    assert found.location == expected.location
+    assert np.array_equal(found.mesh.triangles, expected.mesh.triangles)
+    assert np.allclose(found.mesh.vertices, expected.mesh.vertices, atol=1e-4)  # [m]; worst seen 2e-6
+
+
+@pytest.mark.parametrize("crs", [None, named_crs("urn:ogc:def:crs:OGC:1.3:CRS84"), named_crs("urn:ogc:def:crs:EPSG::4326")])
+def test_a_file_that_says_it_is_in_longitude_and_latitude_is_read_as_one_that_does_not(tmp_path, crs):
+    expected = load_footprints(write(tmp_path / "plain.geojson", *TWO))
+    found = load_footprints(write_in(tmp_path / "named.geojson", TWO, crs))
+    assert np.array_equal(found.mesh.vertices, expected.mesh.vertices)
+
+
+@pytest.mark.parametrize(
+    ("crs", "said"),
+    [
+        (named_crs("EPSG:999999"), "PROJ knows, as EPSG:4326, found 'EPSG:999999'"),
+        (named_crs("the city's own"), 'PROJ knows, as EPSG:4326, found "the city\'s own"'),
+        (named_crs("EPSG:4978"), "Geocentric"),
+        (named_crs("EPSG:5709"), "Vertical"),
+        (named_crs(4326), "expected .*name.*take it out"),
+        ({"type": "link", "properties": {"href": "http://example.com/crs/42", "type": "proj4"}}, "expected .*name.*found .*link"),
+        ("EPSG:4326", "expected .*name.*take it out"),
+    ],
+)
+def test_a_system_that_is_not_known_is_refused_in_one_line(tmp_path, crs, said):
+    path = write_in(tmp_path / "odd.geojson", TWO, crs)
+    with pytest.raises(SourceError, match=rf"odd\.geojson: crs: .*{said}") as error:
+        load_footprints(path)
+    assert "\n" not in str(error.value)
+
+
+def test_positions_outside_a_system_s_area_are_refused(tmp_path):
+    path = write_in(tmp_path / "far.geojson", TWO, named_crs("EPSG:25832"), lambda lonlat: lonlat + 1e12)
+    with pytest.raises(SourceError, match="inside the area of EPSG:25832"):
+        load_footprints(path)
+
+
 REFUSED = {
     "not json": ("{", "no valid JSON"),
     "a list": ("[]", "FeatureCollection"),

@@ -4,7 +4,6 @@ import contextlib
 import json
 import secrets
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
@@ -15,6 +14,7 @@ from typing import Any
 import httpx
 import pytest
 from fastapi import FastAPI
+from serving import STARTUP_S, running
 
 from gi_core.constants import VOXEL_SIZE_M
 from server.app import create_app
@@ -25,7 +25,6 @@ from server.settings import Settings
 
 SOURCE = "procedural:midtown?blocks=1x1&seed=1"
 LIVE_RATE_HZ = 20
-STARTUP_S = 90.0  # a fresh process builds its kernels, on a machine that may be busy
 
 Serving = Callable[[FastAPI], AbstractContextManager[httpx.Client]]
 
@@ -42,22 +41,8 @@ def city(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @contextlib.contextmanager
 def _serving(app: FastAPI) -> Iterator[httpx.Client]:
-    listener = bind("127.0.0.1", 0)
-    server = http_server(app, "critical")
-    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
-    thread.start()
-    try:
-        deadline = time.monotonic() + STARTUP_S
-        while not server.started:
-            assert thread.is_alive(), "the server ended"
-            assert time.monotonic() < deadline, "the server did not start"
-            time.sleep(0.01)
-        with httpx.Client(base_url=f"http://127.0.0.1:{listener.getsockname()[1]}", timeout=60) as client:
-            yield client
-    finally:
-        server.should_exit = True
-        thread.join(10)
-        listener.close()
+    with running(http_server(app, "critical"), bind("127.0.0.1", 0)) as address, httpx.Client(base_url=address, timeout=60) as client:
+        yield client
 
 
 @pytest.fixture(scope="session")

@@ -148,16 +148,9 @@ def test_a_cluster_is_not_taken_yet(sectorlight: RunCommand, tmp_path: Path) -> 
 
 def test_a_bake_into_a_file_is_refused_and_leaves_it(sectorlight: RunCommand, tmp_path: Path) -> None:
     (tmp_path / "notes").write_text("mine")
-    expect_refusal(sectorlight("bake", SOURCE, "-o", str(tmp_path / "notes")), "notes", "folder")
+    for output in (tmp_path / "notes", tmp_path / "notes" / "below"):
+        expect_refusal(sectorlight("bake", SOURCE, "-o", str(output)), f"--output {output}", "folder")
     assert (tmp_path / "notes").read_text() == "mine"
-
-
-def test_what_the_system_refuses_is_one_line_with_the_path(sectorlight: RunCommand, tmp_path: Path) -> None:
-    (tmp_path / "notes").write_text("mine")
-    done = sectorlight("bake", SOURCE, "-o", str(tmp_path / "notes" / "below"), "--quality", "draft")
-    assert done.returncode == 1
-    assert "\n" not in done.stderr.strip()
-    assert str(tmp_path / "notes") in done.stderr
 
 
 def test_a_full_disk_names_the_output(sectorlight: RunCommand, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,7 +4,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from server.finished_replies import MAX_TARGETS, Body, FinishedReplies, FinishedReply
+from server.finished_replies import MAX_REPLIES, MAX_TARGETS, Body, FinishedReplies, FinishedReply
 
 
 def reply(name: str, size: int = 10) -> FinishedReply:
@@ -57,6 +57,14 @@ def test_keeping_a_reply_twice_counts_it_once() -> None:
     for name in "bc":
         replies.keep(target(name), reply(name))
     assert all(replies.at(target(name)) for name in "abc")
+
+
+def test_replies_are_bounded_in_number_however_small_they_are() -> None:
+    replies = FinishedReplies()
+    for number in range(MAX_REPLIES + 2):
+        replies.keep(target("same"), reply(str(number)))
+    assert [replies.get(f'"{number}"') is None for number in range(4)] == [True, True, False, False]
+    assert replies.nbytes == 10 * MAX_REPLIES
 
 
 def test_targets_are_bounded_in_number_and_length() -> None:

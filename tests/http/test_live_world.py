@@ -11,18 +11,9 @@ import httpx
 import numpy as np
 import pytest
 from fastapi import FastAPI
+from serving import until
 
 ProblemOf = Callable[[httpx.Response], dict[str, Any]]
-PATIENCE_S = 20.0  # the machine may be busy
-
-
-def until(found: Callable[[], Any]) -> Any:
-    """What a function gives, once that is true."""
-    deadline = time.monotonic() + PATIENCE_S
-    while not (value := found()):
-        assert time.monotonic() < deadline, "it did not come to that"
-        time.sleep(0.02)
-    return value
 
 
 @pytest.fixture

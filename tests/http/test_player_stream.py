@@ -10,7 +10,7 @@ import socket
 import struct
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from types import SimpleNamespace
@@ -20,6 +20,7 @@ import httpx
 import numpy as np
 import pytest
 from fastapi import FastAPI
+from serving import PATIENCE_S, until
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
@@ -28,28 +29,18 @@ from server.app import create_app
 from server.first_frames import FirstFrames
 from server.frame_prefix import FrameKind
 from server.live import LiveOptions
-from server.player_streams import PlayerStreams, is_full_request
+from server.player_streams import MAX_REASON_BYTES, Close, PlayerStreams, close, is_full_request
 from server.routes.live import memory_bytes
 from server.settings import Settings
 from server.stream_header import parse_header
 from server.tick_signal import TickSignal
 from server.volume_frames import Frame, VolumeDecoder, VolumeEncoder
 
-PATIENCE_S = 20.0
 # A text frame of a client, masked with zeros.
 # What a thousand clients may leave in memory. Five thousand, a thousand at a time, left 5.4, 0.2, 0.1, 1.0 and 2.5 MB: what the allocator
 # keeps. One encoder of ten that stayed would be 120 MB.
 MOST_GROWTH_BYTES = 16 << 20
 ASK_FULL = b'\x81\x90\0\0\0\0{"type": "full"}'
-
-
-def until(found: Callable[[], Any]) -> Any:
-    """What a function gives, once that is true."""
-    deadline = time.monotonic() + PATIENCE_S
-    while not (value := found()):
-        assert time.monotonic() < deadline, "it did not come to that"
-        time.sleep(0.02)
-    return value
 
 
 class Follower:
@@ -160,7 +151,7 @@ def test_first_frames_take_turns_in_the_order_of_arrival() -> None:
 
     async def run() -> None:
         signal, ticker = TickSignal(), SimpleNamespace(listeners=[])
-        signal.follow(ticker)  # type: ignore[arg-type]
+        signal.follow(ticker)
 
         async def tick(number: int) -> None:
             ticker.listeners[0](TickReport(number))
@@ -223,6 +214,17 @@ def test_garbage_ends_a_stream(live_http: httpx.Client, player: str, streams: Pl
 def test_only_a_request_for_a_full_frame_is_one() -> None:
     assert is_full_request('{"type": "full"}')
     assert not any(map(is_full_request, ("", "full", '{"type": 1}', "{}", "null", "[" * 100_000)))
+
+
+def test_a_reason_that_a_close_frame_has_no_room_for_is_cut_between_letters() -> None:
+    said: list[tuple[int, str]] = []
+
+    async def note(code: int, reason: str) -> None:
+        said.append((code, reason))
+
+    asyncio.run(close(SimpleNamespace(close=note), Close(1013, "x" + "ä" * 100)))
+    assert said == [(1013, "x" + "ä" * 61)]
+    assert len(said[0][1].encode()) == MAX_REASON_BYTES
 
 
 def test_a_player_that_is_not_there(live_http: httpx.Client, player: str) -> None:

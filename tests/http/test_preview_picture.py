@@ -17,9 +17,9 @@ from gi_core.lighting import DirectionalLight, Lighting
 from gi_core.world import Room
 from server import tonemap
 from server.camera import Camera
-from server.preview import Look, indirect_pixels, render
+from server.preview import indirect_pixels, render
 from server.preview_air import background
-from server.preview_light import MAX_VOLUMES, ServedLight, plan_volumes
+from server.preview_light import MAX_VOLUMES, Look, ServedLight, plan_volumes
 from server.preview_scene import MAX_SECTORS, PreviewScene, plan_sectors
 from server.raycast import RayCaster
 

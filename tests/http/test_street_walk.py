@@ -165,9 +165,10 @@ def test_the_lattice_is_what_the_sectors_say(city: Path) -> None:
             lowest = int(np.flatnonzero(column)[0]) if column.any() else 0
             expected = y0 + lowest if lowest > 0 and column[lowest] == VOXEL_OUTDOORS else None
             assert lattice.level(x0 + x, z0 + z) == expected
-    assert lattice.sectors_read == len(dataset.world.sectors)
     assert lattice.level(10**6, 0) is None
     assert lattice.eye_height(1e7, 0.0) is None
+    assert lattice.columns_of(SectorIndex(900, 900)) == []
+    assert lattice.sectors_read == len(dataset.world.sectors)  # what lies beyond them is not kept: of that there is no end
     middle = lattice.eye_height(5.0, 30.0)
     assert middle is not None
     assert 0 < middle < 4

@@ -4,7 +4,6 @@ import asyncio
 import contextlib
 import json
 import socket
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import uvicorn
+from serving import running
 from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
@@ -25,7 +25,6 @@ from server.encoding import half_scale, half_texels
 from server.stream_header import StreamHeader
 from server.volume_frames import VolumeEncoder
 
-STARTUP_S = 30.0
 HEADER = StreamHeader(shape=(6, 4, 8, 8))
 SLAB_TICKS = 10  # the volume moves by one voxel this often
 
@@ -196,22 +195,9 @@ class StandIn:
 @contextlib.contextmanager
 def _standing_in(**faults: Any) -> Iterator[tuple[StandIn, str]]:
     world = StandIn(Behaviour(**faults))
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        server = uvicorn.Server(
-            uvicorn.Config(world.app(), log_level="critical", ws_per_message_deflate=False, timeout_graceful_shutdown=2)
-        )
-        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
-        thread.start()
-        try:
-            deadline = time.monotonic() + STARTUP_S
-            while not server.started:
-                assert thread.is_alive(), "the server ended"
-                assert time.monotonic() < deadline, "the server did not start"
-                time.sleep(0.01)
-            yield world, f"http://127.0.0.1:{listener.getsockname()[1]}"
-        finally:
-            server.should_exit = True
-            thread.join(10)
+    config = uvicorn.Config(world.app(), log_level="critical", ws_per_message_deflate=False, timeout_graceful_shutdown=2)
+    with running(uvicorn.Server(config), socket.create_server(("127.0.0.1", 0))) as address:
+        yield world, address
 
 
 @pytest.fixture(scope="session")
