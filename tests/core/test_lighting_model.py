@@ -221,7 +221,7 @@ def test_no_place_time_or_weather_gives_an_impossible_light(
 
 def test_moonlight_by_phase_and_distance() -> None:
     def lux(phase: float, distance: float) -> float:
-        moon = MoonPosition(0.0, 45.0, 45.0, distance, phase, 0.5)
+        moon = MoonPosition(0.0, 45.0, 45.0, distance, phase)
         return float(LUMINANCE_FROM_RGB @ RGB_FROM_SPECTRUM @ moon_spectrum(moon))
 
     mean = MEAN_MOON_DISTANCE_AU
