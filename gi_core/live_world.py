@@ -129,6 +129,8 @@ class LiveWorld:
         self.streamer = Streamer(sector_table(dataset.world), dataset.sector, self._place, options, self._right_of_way)
         self.streamer.lamps_planned = bool(dataset.world.lamps)
         self.volumes = LiveVolumes(self._device, frozenset(dataset.world.sectors), self.streamer.residents, basis)
+        self._evicted: tuple[SectorIndex, ...] = ()
+        """Since volumes were last told of changes: a tick that fails leaves them to the next."""
         self._put_off = 0
         """How many ticks ago the streaming plan was wanted."""
         self._needs = LightNeeds(len(self.streamer.table.sectors))
@@ -314,6 +316,7 @@ class LiveWorld:
             return ()
         self._put_off = 0
         self.plan = self.streamer.step(players.positions, players.velocities)
+        self._evicted += self.plan.evictions
         return self.plan.evictions
 
     def _step_shadows(self, players: TickPlayers, light: LiveLight, boxes: Sequence[MovingBox]) -> None:
@@ -326,7 +329,8 @@ class LiveWorld:
 
     def _advance(self, tick: int, gains_changed: bool, report: TickReport) -> list[SectorIndex]:
         """Sectors that show something else from this tick on, or are gone."""
-        residents, changed = self.streamer.residents, list(report.evicted)
+        residents, changed = self.streamer.residents, list(self._evicted)
+        self._evicted = ()
         # Others have shown what they show since they were looked at last.
         self._fading.update(report.loaded, report.relit, report.settled)
         for index in list(residents) if gains_changed else self._fading.intersection(residents):
