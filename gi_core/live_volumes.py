@@ -5,7 +5,6 @@ players whose volumes read it. A thousand players who stand in settled light cos
 """
 
 import math
-import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -93,10 +92,10 @@ class LiveVolumes:
                 self._fall_behind(name, tick, _away_m(index, *self._places[name]))
 
     def fill(
-        self, tick: int, until_s: float, shown: ShownCubes, placeholder: Callable[[SectorIndex], Float32]
+        self, tick: int, is_over: Callable[[], bool], shown: ShownCubes, placeholder: Callable[[SectorIndex], Float32]
     ) -> tuple[tuple[str, ...], int]:
-        """Fill and publish volumes in the order of ``fill_plan``, at least one, until ``time.perf_counter`` says ``until_s``. While the
-        device fills one, the one before is published.
+        """Fill and publish volumes in the order of ``fill_plan``, at least one, until the time for it ``is_over``. While the device
+        fills one, the one before is published.
 
         -> whose, and how many wait for another tick
         """
@@ -115,7 +114,7 @@ class LiveVolumes:
 
         under_way: str | None = None
         for row in order.tolist():
-            if under_way is not None and time.perf_counter() >= until_s:
+            if under_way is not None and is_over():
                 break
             name = ready[row]
             self.of_player[name].enqueue(self._residents, shown)

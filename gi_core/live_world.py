@@ -189,9 +189,10 @@ class LiveWorld:
         lap("relight")
         changed = self._advance(tick, gains_changed, report)
         self.volumes.note(tick, changed)
-        until_s = started + fill_ms / 1e3
         shown = partial(self._shown, light=light)
-        report.filled, report.waiting = self.volumes.fill(tick, until_s, shown, self._placeholder)
+        report.filled, report.waiting = self.volumes.fill(
+            tick, lambda: time.perf_counter() - started >= fill_ms / 1e3, shown, self._placeholder
+        )
         lap("volumes")
         self._step_shadows(players, light, boxes)
         lap("shadow_map")

@@ -59,6 +59,7 @@ class Ticker:
         self.listeners: list[Listener] = []
         self._commands: queue.SimpleQueue[tuple[Command, Future[int]]] = queue.SimpleQueue()
         self._stop = threading.Event()
+        self._now = time.perf_counter
         self._worker: Executor = ThreadPoolExecutor(1, thread_name_prefix="lighting")
         self._track = LightTrack(world.dataset.world.location, self._worker, sky)
         self._track.set_weather(state.weather.at)
@@ -136,13 +137,13 @@ class Ticker:
     def _beat(self) -> None:
         """Ticks, until the ticker is stopped."""
         period_s = 1 / self.rate_hz
-        start = time.perf_counter()
+        start = self._now()
         while not self._stop.is_set():
             due = start + (self.tick + 1) * period_s
-            now = time.perf_counter()
+            now = self._now()
             if now < due:
                 self._stop.wait(due - now)
-                now = time.perf_counter()
+                now = self._now()
                 if self._stop.is_set():
                     break
             number = self.tick + 1
@@ -156,13 +157,13 @@ class Ticker:
             self._running.set()
 
     def _tick(self, number: int, due: float, period_s: float) -> None:
-        begun = time.perf_counter()
+        begun = self._now()
         self.tick = number
         try:
             self._apply_commands(number)
             light = self._light_at(number)
             players = players_at(self.state.players, number, self.rate_hz)
-            lit = time.perf_counter()
+            lit = self._now()
             left_ms = FILL_UNTIL * period_s * 1e3 - (lit - begun) * 1e3
             report = self.world.tick(number, players, light, self.state.moving_boxes, left_ms)
             report.ms["light"] = (lit - begun) * 1e3
@@ -175,7 +176,7 @@ class Ticker:
             return
         self.failure = None
         self._look_ahead(number + LOOK_AHEAD_TICKS, begun)
-        took_ms = (time.perf_counter() - begun) * 1e3
+        took_ms = (self._now() - begun) * 1e3
         self.stats.add(report, took_ms, max(begun - due, 0.0) * 1e3, period_s * 1e3)
         for listener in tuple(self.listeners):
             listener(report)
@@ -235,7 +236,7 @@ class Ticker:
     def _look_ahead(self, number: int, begun: float) -> None:
         """Make a later tick's light in one that has been short: where it changes, sectors are relit and volumes filled as well."""
         last = self.state.clock.last_tick
-        if (time.perf_counter() - begun) * 1e3 < SHORT_TICK_MS and (last is None or number <= last):
+        if (self._now() - begun) * 1e3 < SHORT_TICK_MS and (last is None or number <= last):
             with suppress(Exception):  # the tick that it is for says so, if it still cannot be made
                 self._light_at(number)
 

@@ -3,7 +3,6 @@
 import time
 from datetime import datetime, timedelta
 from itertools import count
-from types import SimpleNamespace
 
 import numpy as np
 from live_run import EAST, GOLDEN, STREET, Run, at, light_of
@@ -38,7 +37,7 @@ def test_whose_own_sector_was_relit_is_served_first_and_nobody_is_forgotten(worl
     for tick in range(1000, 1000 + len(players.ids)):
         world.volumes.follow(tick, players.ids, players.positions)
         world.volumes.note(tick, [SectorIndex(-1, 0)] if tick == 1000 else [])
-        filled, waiting = world.volumes.fill(tick, -np.inf, lambda sector: world._shown(sector, light), world._placeholder)
+        filled, waiting = world.volumes.fill(tick, lambda: True, lambda sector: world._shown(sector, light), world._placeholder)
         assert len(filled) == 1
         order += filled
         assert waiting == len(players.ids) - len(order)
@@ -46,14 +45,13 @@ def test_whose_own_sector_was_relit_is_served_first_and_nobody_is_forgotten(worl
     assert set(order[:4]) == {"p1", "p3", "p5", "p7"}
 
 
-def test_no_volume_is_begun_when_the_ticks_time_for_them_is_over(world, engine, monkeypatch):
+def test_no_volume_is_begun_when_the_ticks_time_for_them_is_over(world, engine):
     players, light = far_from_the_change(world, engine)
     looks = count(1)
-    monkeypatch.setattr("gi_core.live_volumes.time", SimpleNamespace(perf_counter=lambda: float(next(looks))))
     world.volumes.follow(1000, players.ids, players.positions)
     world.volumes.note(1000, [SectorIndex(0, 0)])
     # A second passes with each look at the clock: the first volume needs none, one begins at 1 s, another at 2 s, none at 3 s.
-    filled, waiting = world.volumes.fill(1000, 3.0, lambda sector: world._shown(sector, light), world._placeholder)
+    filled, waiting = world.volumes.fill(1000, lambda: next(looks) >= 3, lambda sector: world._shown(sector, light), world._placeholder)
     assert (len(filled), waiting) == (3, 5)
 
 

@@ -92,7 +92,7 @@ def beat(monkeypatch: pytest.MonkeyPatch) -> Iterator[Beat]:
         world = SlowWorld(clock, ticks, takes)
         ticker = Ticker(world, LiveState(starting_clock(Location(), "12:00", RATE).with_paused(0, True), fixed_weather("clear")))
         made.append(ticker)
-        monkeypatch.setattr("server.ticker.time", clock)
+        monkeypatch.setattr(ticker, "_now", clock.perf_counter)
         monkeypatch.setattr(ticker, "_stop", clock)
 
         def dawdle(state: LiveState, number: int) -> LiveState:
