@@ -80,8 +80,8 @@ def print_tables(engine: AlikeEngine) -> None:
         cells = [f"{100 * share[number]:.0f}, " + "{:.1f} / {:.0f}".format(*(100 * size[number])) for share, size in rows]
         print(f"| {name} | {' | '.join(cells)} |")
     for name, which in ALIKE.items():
-        added = [to_mean(found, probes, which) for found in parts] if which else []
-        engine.added = {(light.digest, i): array for light, found in zip(lightings, added, strict=False) for i, array in found.items()}
+        added = [to_mean(found, probes, which) for found in parts]
+        engine.added = {(light.digest, i): array for light, found in zip(lightings, added, strict=True) for i, array in found.items()}
         print(f"\n{name}")
         seam_study.print_table(engine)
         seam_walls.print_table(engine)

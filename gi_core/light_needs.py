@@ -64,6 +64,6 @@ class LightNeeds:
         if light is not self._light:
             self._light = light
             if self._numbers is not None:
-                self._moved[rows] = relative_changes(self._numbers[rows], self._scale[rows], light)
-                self.exact[rows[self._moved[rows] > 0]] = False
+                moved = self._moved[rows] = relative_changes(self._numbers[rows], self._scale[rows], light)
+                self.exact[rows[moved > 0]] = False
         return np.maximum(self._change[rows], self._moved[rows] * self._share[rows])
