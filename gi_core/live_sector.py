@@ -120,6 +120,9 @@ class LiveSector:
         self._first: cl.Buffer | None = None
         self._room: cl.Buffer | None = None
         self._blended_at = -1
+        self._converted: cl.Buffer | None = None
+        """What is shown, in the basis that is served, and the ``shown_at`` that it is of."""
+        self._converted_at = -1
         self._lamps_late = False
 
     @property
@@ -247,8 +250,12 @@ class LiveSector:
 
     def shown(self, settings: Settings, placeholder: Callable[[], Float32], basis: str) -> cl.Buffer:
         """The light to show, on the device, in a basis: the sector's own under the artists' gains, or while it fades a blend with what
-        was shown before: ``placeholder`` (6, 3) [lx], a cube, where that was not of the sector."""
-        return self.resident.converted(basis, self._own_shown(settings, placeholder))
+        was shown before: ``placeholder`` (6, 3) [lx], a cube, where that was not of the sector. As it is in the tick ``shown_at``."""
+        if basis == basis_of_size(self.resident.sector.basis_size):
+            return self._own_shown(settings, placeholder)
+        if self._converted is None or self._converted_at != self.shown_at:
+            self._converted, self._converted_at = self.resident.converted(basis, self._own_shown(settings, placeholder)), self.shown_at
+        return self._converted
 
     def _own_shown(self, settings: Settings, placeholder: Callable[[], Float32]) -> cl.Buffer:
         if not self.is_fading and settings.bounce_factor == 1.0 and not settings.has_ambient:

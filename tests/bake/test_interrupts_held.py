@@ -31,8 +31,13 @@ def test_an_interrupt_in_the_block_reaches_the_parent_when_it_ends() -> None:
             signal.raise_signal(signal.SIGINT)
             reached_the_end = True
 
-    with pytest.raises(KeyboardInterrupt):
-        interrupt_within()
+    # A shell has what it starts in the background ignore interrupts.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            interrupt_within()
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert reached_the_end
 
 

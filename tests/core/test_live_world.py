@@ -21,6 +21,7 @@ from gi_core.live_sector import FADE_TICKS, LiveLight, LiveSector, fade_ticks
 from gi_core.live_world import LiveWorld, TickReport
 from gi_core.relight import Relighter
 from gi_core.relight_input import relight_input
+from gi_core.resident_sector import ResidentSector
 from gi_core.settings import NEUTRAL, Settings
 from gi_core.world import Lamp
 
@@ -78,6 +79,31 @@ def test_volumes_in_each_basis_are_the_very_bytes_of_a_query(basis, settings):
         query = engine.volume(STREET, lighting, settings, basis=basis).values
         # Gains are applied in a kernel here, in NumPy there: float32 rounds either way.
         np.testing.assert_allclose(found, query, atol=0 if settings is NEUTRAL else 1e-6 * query.max())
+    finally:
+        world.close()
+
+
+def test_harmonics_are_converted_where_they_change_and_not_where_they_are_read(monkeypatch):
+    dataset = Dataset.open(HARMONICS)
+    engine, world = Engine(dataset), LiveWorld(dataset, shadow_map=False)
+    engine.lamps, converted, convert = (), [], ResidentSector.converted
+
+    def note(sector, *arguments):
+        converted.append(sector.sector.index)
+        return convert(sector, *arguments)
+
+    try:
+        run = Run(world)
+        for hour in ("12:00", "16:00"):
+            light = light_of(world, engine.lighting(hour, "clear"))
+            run.settle(at(STREET), light)
+            for metres in (3.125, 6.25, 0.0):
+                place = STREET + np.array([0.0, 0.0, metres])
+                with monkeypatch.context() as patched:
+                    patched.setattr(ResidentSector, "converted", note)
+                    run.tick(at(place), light)
+                np.testing.assert_array_equal(world.published("p0").values, engine.volume(place, light.lighting, basis="cube").values)
+        assert not converted
     finally:
         world.close()
 
