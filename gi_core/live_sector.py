@@ -98,6 +98,9 @@ class LiveSector:
         """The plan of the shadow map that its samples are from; None before any."""
         self.has_other_source = False
         """Whether the next relight finds the sun's visibility from another source than the last did."""
+        self._has_other_samples = False
+        """Whether it finds other samples than the last did. Even of nearly the same sun they may differ much from those before: more of a
+        tower's surfels lie on one map than on another."""
         self.lit_ahead: LiveLight | None = None
         """What ``light_ahead`` lit it by, and how far its light moved in the end."""
         self.moved_ahead = 0.0
@@ -112,7 +115,7 @@ class LiveSector:
         self._blended_faded = 0
         """``_faded`` when what is shown was last blended."""
         self._starts_fade = False
-        """Whether the relight under way makes what it fades to, from what ``_cubes`` are."""
+        """Whether the relight under way makes what it fades to, from what ``_cubes`` are or what it fades to already."""
         self._cubes: Float32 = np.zeros((sector.probe_count, sector.basis_size, 3), np.float32)
         self.host_nbytes = self.resident.host_nbytes + self._cubes.nbytes
         """Bytes in the host's memory."""
@@ -160,6 +163,7 @@ class LiveSector:
         assert self.samples is not None
         shadow_map.sample(self.samples)
         self.has_other_source |= self.sampled_of is None
+        self._has_other_samples = True
         self.sampled_of = shadow_map.plan
 
     def drop_sun_samples(self) -> None:
@@ -214,10 +218,7 @@ class LiveSector:
         """Take note of the cubes (P, B, 3) [lx] that a relight gave: how far it moved the probes' light, as a share of the brightest."""
         peak = float(after.max(initial=0.0))
         moved = float(np.abs(after - self._cubes).max(initial=0.0))
-        if self._starts_fade:
-            self._starts_fade = False
-            self._faded = self._blended_faded = FADE_TICKS - fade_ticks(self._cubes, after)
-        self._cubes = after
+        self._take_cubes(after)
         share = moved / peak if peak > 0 else float(moved > 0)
         self._unshown += share
         return 1.0 if self._lamps_late else share
@@ -230,7 +231,7 @@ class LiveSector:
         if not self.set_lamps(light, wait=False):
             return False
         self._take_samples(light, is_read)
-        self._cubes = relighter.converge(self.resident, light.given).cubes
+        self._take_cubes(relighter.converge(self.resident, light.given).cubes)
         return True
 
     def advance(self, tick: int, must_show: bool, is_read: bool) -> None:
@@ -299,19 +300,26 @@ class LiveSector:
             cl.enqueue_copy(self._device.queue, self._shown, np.tile(row.astype(np.float32), (sector.probe_count, 1)))
 
     def _take_samples(self, light: LiveLight, is_read: bool) -> None:
-        """Before a relight: forget samples that are too old for it, and where the sun's visibility has another source than it had, have
-        what is shown go over from what it was, if it is read."""
+        """Before a relight: forget samples that are too old for it, and where it finds others, have what is shown go over from what it
+        was, if it is read."""
         self._expire_samples(light)
-        if not self.has_other_source:
+        if not (self.has_other_source or self._has_other_samples):
             return
-        self.has_other_source = False
+        self.has_other_source = self._has_other_samples = False
         if not is_read or (self._shown is None and self.is_fading):
             return  # nobody sees it change, or nothing of it was shown
         if self._shown is None:
             self._shown = self._device.allocate(self.resident.cubes.size)
             cl.enqueue_copy(self._device.queue, self._shown, self.resident.cubes)
-            self._starts_fade = True
-        self._faded = self._blended_faded = 0
+        self._starts_fade = True
+
+    def _take_cubes(self, after: Float32) -> None:
+        """What a relight gave (P, B, 3) [lx]. A fade that it starts takes as long as its size asks for, and what is left of one before."""
+        if self._starts_fade:
+            self._starts_fade = False
+            left = FADE_TICKS - self._faded + fade_ticks(self._cubes, after)
+            self._faded = self._blended_faded = max(FADE_TICKS - left, 0)
+        self._cubes = after
 
     def _expire_samples(self, light: LiveLight) -> None:
         """Forget samples of maps for a sun too far from where it stands; back to the bake's visibility when none is left."""
@@ -323,10 +331,11 @@ class LiveSector:
         elif samples.forget_old(light.to_sun):
             if samples.are_there:
                 self.resident.set_sun_sample(samples.sun_sample)
+                self._has_other_samples = True
             else:
                 self.sampled_of = None
                 self.resident.set_sun_sample(None)
-                self.has_other_source = is_near(of.to_sun, light.to_sun, SUN_JUMPED_DEGREES)
+                self.has_other_source = self._has_other_samples = is_near(of.to_sun, light.to_sun, SUN_JUMPED_DEGREES)
 
 
 def fade_ticks(before: Float32, after: Float32) -> int:

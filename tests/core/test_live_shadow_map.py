@@ -2,15 +2,18 @@
 
 import threading
 import time
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
+import pyopencl as cl
 import pytest
 from live_run import EAST, GOLDEN, LATE_S, STREET, Run, at, is_exact, largest_change, largest_step, light_of, sampled, unbound
 
 from gi_core.constants import VOXEL_INDOORS, VOXEL_OUTDOORS
 from gi_core.dataset import Dataset
 from gi_core.engine import Engine
+from gi_core.light_needs import WHOLLY
 from gi_core.live_sector import FADE_STEP, FADE_TICKS, LiveLight
 from gi_core.live_world import LiveWorld, TickReport
 from gi_core.shadow_plan import LOWEST_SUN_DEGREES, is_near
@@ -89,6 +92,33 @@ def test_a_sector_has_samples_before_somebody_who_comes_sees_it(engine, speed, f
         assert len(world.volumes.looked_at) == 2
     finally:
         world.close()
+
+
+def test_nothing_pops_when_other_samples_say_otherwise(shaded, engine):
+    """As where only a later map covers a tower: samples are there, all of them dark, and another map is drawn."""
+    world, may_read = shaded
+    may_read.set()
+    run, lighting = Run(world), engine.lighting("15:00", "clear")
+    light, residents = light_of(world, lighting), world.streamer.residents
+    run.until(at(STREET), light, lambda r: sampled(world))
+    lit = run.settle(at(STREET), light)
+    for sector in residents.values():
+        samples = sector.samples
+        cl.enqueue_fill_buffer(world._device.queue, samples.sun_sample, np.uint8(0), 0, samples.sun_sample.size)
+        sector.resident.set_sun_sample(samples.sun_sample)
+        sector.sampled_of = replace(sector.sampled_of, to_sun=-sector.sampled_of.to_sun)
+        world._needs.disturb(world._row[sector.resident.sector.index], WHOLLY)
+    moving = light_of(world, lighting, standing=False)
+    dark = run.tick(at(STREET), moving) and world.published("p0")
+    assert largest_change(dark.values.reshape(6, -1, 3), lit.reshape(6, -1, 3)) > 10 * FADE_STEP
+    frames = [dark]
+    for _ in range(3 * FADE_TICKS):
+        run.tick(at(STREET), moving)
+        frames.append(world.published("p0"))
+        time.sleep(0.002)
+    whole_way = largest_step(dark, frames[-1])
+    assert whole_way > 10 * FADE_STEP
+    assert max(largest_step(*pair) for pair in pairwise(frames)) <= 1.5 * max(FADE_STEP, whole_way / FADE_TICKS)
 
 
 def test_nothing_pops_when_samples_grow_too_old(shaded, engine, monkeypatch):
