@@ -98,8 +98,10 @@ class LightTrack:
 
     def _make(self, number: int, step_s: float, weather_at: WeatherAt) -> Lighting:
         moment = _EPOCH + timedelta(seconds=number * step_s)
-        return self._lighting(moment, weather_at)
+        # A clock that runs at 60 x makes three a second: kept, they would push out what queries ask for again and again.
+        return self._lighting(moment, weather_at, keep=False)
 
-    def _lighting(self, moment: datetime, weather_at: WeatherAt) -> Lighting:
-        lighting = make_lighting(self._location, moment, weather_at(moment))
-        return lighting if self._sky is None else lighting_with_sky(lighting, self._sky)
+    def _lighting(self, moment: datetime, weather_at: WeatherAt, keep: bool = True) -> Lighting:
+        lighting = make_lighting(self._location, moment, weather_at(moment), keep)
+        with_sky = lighting_with_sky if keep else lighting_with_sky.__wrapped__
+        return lighting if self._sky is None else with_sky(lighting, self._sky)

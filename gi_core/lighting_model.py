@@ -35,15 +35,17 @@ METER_CONSTANT = 12.5
 MEAN_REFLECTANCE = 0.18
 
 
-def make_lighting(location: Location, time: datetime | str, weather: Weather | str = "clear") -> Lighting:
+def make_lighting(location: Location, time: datetime | str, weather: Weather | str = "clear", keep: bool = True) -> Lighting:
     """The light at a place and time in a weather; the same arguments give the same bytes.
 
-    Arrays are read-only and shared between callers: the last few hundred results are kept. A naive datetime is local time.
+    Arrays are read-only and shared between callers: the last few hundred results are kept, unless ``keep`` says that nobody is going to
+    ask for this one again. A naive datetime is local time.
     Raises UnknownTimeError and UnknownWeatherError (see ``parse_time`` and ``parse_weather``).
     """
     moment = parse_time(time, location) if isinstance(time, str) else local_time(time, location)
     # Datetimes of one zone are equal when their clocks read the same, which they do for two hours in autumn: UTC tells these apart.
-    return _make_lighting(location, moment.astimezone(UTC), as_weather(weather))
+    make = _make_lighting if keep else _make_lighting.__wrapped__
+    return make(location, moment.astimezone(UTC), as_weather(weather))
 
 
 @lru_cache(maxsize=256)

@@ -145,6 +145,20 @@ def test_a_standing_clock_can_jump_from_one_of_the_repeated_hours_to_the_other()
         assert [track.at(moment, 0).time[-6:] for moment in (first, first.replace(fold=1))] == ["-04:00", "-05:00"]
 
 
+def test_a_clock_that_runs_leaves_what_queries_asked_for_in_memory() -> None:
+    """At 60 x, a day makes twelve times as many as are kept."""
+    start = datetime(2024, 6, 1, 8, tzinfo=UTC)
+    asked = make_lighting(Location(), start + timedelta(hours=1))
+    kept = _make_lighting.cache_info().currsize
+    with ThreadPoolExecutor(1) as worker:
+        track = LightTrack(Location(), worker)
+        track.set_weather(lambda _: parse_weather("clear"))
+        for second in range(3):
+            track.at(start + timedelta(minutes=second), 60.0)
+    assert _make_lighting.cache_info().currsize == kept
+    assert make_lighting(Location(), start + timedelta(hours=1)) is asked
+
+
 def test_the_last_evening_of_the_last_year_has_light() -> None:
     """In UTC it is the next year already."""
     assert make_lighting(Location(), "2599-12-31T23:00").time.startswith("2599-12-31T23:00:00")
