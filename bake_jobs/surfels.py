@@ -9,6 +9,9 @@ significance. Sorting by the key therefore sorts surfels by brick, and a brick i
 The direction keeps the two faces of a thin wall apart, the room what stands on the floor at either side of it: a brick of 4 m that
 lay under the wall between two rooms would carry the light of one into the other.
 
+What then lies in one brick but is seen together by no probe, as the front of a house and the wall of its light well that looks the same
+way, becomes bricks of their own: otherwise the well would get the street's light. That costs no factor, since each probe sees one of them.
+
 Cells are 1 m and bricks 4 m wide at level 0, and twice as wide at each next level. A 1 m cell goes to the level that the distance of
 the closest probe which sees it asks for: beyond some 10 m, the rays of a 16 x 16 face fall further apart than 1 m, and every hit
 would become a surfel of its own.
@@ -17,6 +20,8 @@ would become a surfel of its own.
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from bake_jobs.distinct import distinct, least
 from bake_jobs.gbuffer import GBuffer
@@ -123,6 +128,11 @@ def cluster(gbuffer: GBuffer, room: UInt16, origin: Float64, albedo: Float32, em
     coarse_cell = cell[of_fine_cell] >> level[:, None]
     surfel_key, surfel_of_fine = distinct(_key(coarse_cell, room_key[of_fine_cell], direction[of_fine_cell], level))
     of_hit = surfel_of_fine[fine_of_hit]
+    brick_of_surfel = np.cumsum(np.diff(surfel_key >> _BRICK_SHIFT, prepend=surfel_key[:1] >> _BRICK_SHIFT) != 0)
+    part = _seen_together(brick_of_surfel, of_hit, hit // gbuffer.rays)
+    by_part = np.argsort(part, kind="stable")
+    surfel_key, part = surfel_key[by_part], part[by_part]
+    of_hit = np.argsort(by_part)[of_hit]
     count = len(surfel_key)
     hits_of_surfel = np.bincount(of_hit, minlength=count)
 
@@ -134,7 +144,8 @@ def cluster(gbuffer: GBuffer, room: UInt16, origin: Float64, albedo: Float32, em
     mean_normal = mean(normal)
     mean_normal /= np.maximum(np.linalg.norm(mean_normal, axis=1, keepdims=True), 1e-12)
     position = _on_surface(mean(local), mean_normal, local, of_hit)
-    brick_key, first = np.unique(surfel_key >> _BRICK_SHIFT, return_index=True)
+    first = np.flatnonzero(np.diff(part, prepend=-1))
+    brick_key = surfel_key[first] >> _BRICK_SHIFT
     brick_cell = np.stack([brick_key >> 9 & 0xFFFF, brick_key >> 41 & 0x1FFF, brick_key >> 25 & 0xFFFF], axis=1)
     brick_cell -= np.array([_HALF_RANGE, _HALF_HEIGHT, _HALF_RANGE])
     return Surfels(
@@ -149,6 +160,19 @@ def cluster(gbuffer: GBuffer, room: UInt16, origin: Float64, albedo: Float32, em
         of_hit=of_hit,
         hit=hit,
     )
+
+
+def _seen_together(brick: Int64, of_hit: Int64, probe: Int64) -> Int64:
+    """The first surfel (S,) of the part of its brick that each belongs to: a probe that sees two surfels of a brick makes them one part.
+
+    brick : (S,) numbers, ascending; of_hit, probe : (h,) which surfel each hit is of, and which probe's
+    """
+    views, view_of_hit = distinct(brick[of_hit] << 10 | probe)
+    count = len(brick)
+    links = coo_array((np.ones(len(of_hit), bool), (of_hit, count + view_of_hit)), shape=(count + len(views),) * 2)
+    _, part = connected_components(links, directed=False)
+    _, first, of_surfel = np.unique(part[:count], return_index=True, return_inverse=True)
+    return np.asarray(first[of_surfel], np.int64)
 
 
 def _on_surface(mean: Float64, normal: Float64, hits: Float64, of_hit: Int64) -> Float64:

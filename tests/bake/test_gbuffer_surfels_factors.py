@@ -143,8 +143,30 @@ def test_bricks_are_distinct_and_none_is_empty_or_overfull(town):
     assert s.brick_starts[-1] == s.count
     assert (sizes >= 1).all()
     assert (sizes <= 64).all()  # 4 x 4 x 4 cells
-    keys = {(*cell, level, way) for cell, level, way in zip(s.brick_cell.tolist(), s.brick_level, s.brick_direction, strict=True)}
-    assert len(keys) == len(s.brick_cell)
+    # Those of one cell that face one way are what different probes see.
+    probe, brick_of_hit = s.hit // town.seen.rays, s.brick_of_surfel[s.of_hit]
+    seen_by = set()
+    for brick in range(len(s.brick_cell)):
+        key = (*s.brick_cell[brick].tolist(), int(s.brick_level[brick]), int(s.brick_direction[brick]))
+        views = {(key, int(who)) for who in np.unique(probe[brick_of_hit == brick])}
+        assert not views & seen_by
+        seen_by |= views
+    assert len({key for key, _ in seen_by}) < len(s.brick_cell)  # or this scene tests nothing
+
+
+def test_walls_that_no_probe_sees_together_are_two_bricks(build):
+    """A thin house's front, and three metres behind it the wall of its light well, which looks the same way: one cell holds both."""
+    house = build().ground().box((0.1, 0, 4.5), (4, 12, 4.9), 0.5).box((0.1, 0, 7.5), (4, 12, 9), 0.5)
+    front, well, beside = (2.0, 2.0, 2.0), (2.0, 2.0, 6.0), (-6.0, 2.0, 2.0)
+
+    def facing_south(*probes):
+        found = look(house.scene(), probes, edge=16).surfels
+        cell = (found.brick_cell == (0, 0, 1)).all(axis=1) & (found.brick_direction == 5) & (found.brick_level == 0)
+        return [np.unique(np.floor(found.position[found.brick_of_surfel == brick, 2])).tolist() for brick in np.flatnonzero(cell)]
+
+    assert facing_south(front, well) == [[4.0], [7.0]]
+    assert facing_south(front) == [[4.0]]
+    assert facing_south(front, well, beside) == [[4.0, 7.0]]
 
 
 def test_levels_grow_with_the_distance_of_the_closest_that_sees(town):

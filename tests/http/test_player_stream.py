@@ -36,10 +36,10 @@ from server.stream_header import parse_header
 from server.tick_signal import TickSignal
 from server.volume_frames import Frame, VolumeDecoder, VolumeEncoder
 
-# A text frame of a client, masked with zeros.
 # What a thousand clients may leave in memory. Five thousand, a thousand at a time, left 5.4, 0.2, 0.1, 1.0 and 2.5 MB: what the allocator
 # keeps. One encoder of ten that stayed would be 120 MB.
 MOST_GROWTH_BYTES = 16 << 20
+# A text frame of a client, masked with zeros.
 ASK_FULL = b'\x81\x90\0\0\0\0{"type": "full"}'
 
 
