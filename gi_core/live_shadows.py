@@ -44,8 +44,9 @@ NEAR_M = HALF_MAP_M - SECTOR_SIZE_M - 1.0
 # Maps are drawn around where players will be in so long [s], but not farther ahead than this [m]: the map then still covers what their
 # volumes read behind them.
 LEAD_S, MOST_LEAD_M = 1.0, 24.0
-# Triangles of sectors towards the sun that are kept in memory, 48 bytes each.
-KEPT_BYTES = 1 << 26
+# Triangles of sectors towards the sun that are kept in memory, 48 bytes each: for each player several maps' of Midtown, and all in all a
+# city's.
+KEPT_BYTES_PER_PLAYER, MOST_KEPT_BYTES = 1 << 23, 1 << 26
 
 Casters = Mapping[SectorIndex, AnyArray]
 
@@ -138,7 +139,8 @@ class LiveShadows:
             sources = {residents[index].sampled_of for index in sectors_within(NEAR_M, positions[player], residents)}
             if any(is_outdated(source, to_sun, boxes) for source in sources):
                 self._turn = player + 1
-                self._planning = self._planner.submit(self._prepare, positions[player].copy(), to_sun, boxes)
+                kept_bytes = min(count * KEPT_BYTES_PER_PLAYER, MOST_KEPT_BYTES)
+                self._planning = self._planner.submit(self._prepare, positions[player].copy(), to_sun, boxes, kept_bytes)
                 return
         self._turn += PLAYERS_LOOKED_AT_PER_TICK
 
@@ -156,8 +158,8 @@ class LiveShadows:
         """Stop planning."""
         self._planner.shutdown(cancel_futures=True)
 
-    def _prepare(self, position: Float64, to_sun: Float64, boxes: Float64) -> tuple[ShadowPlan | None, Casters]:
-        """In the planner's thread: a map, and the triangles that it draws."""
+    def _prepare(self, position: Float64, to_sun: Float64, boxes: Float64, kept_bytes: int) -> tuple[ShadowPlan | None, Casters]:
+        """In the planner's thread: a map, and the triangles that it draws. So many bytes of what was read last are kept."""
         plan = plan_map(position, to_sun, self._known, *self._heights, boxes)
         if plan is None:
             return None, {}
@@ -166,7 +168,7 @@ class LiveShadows:
             give_way()
             casters[index] = self._casters[index] = self._casters.pop(index) if index in self._casters else self._read(index)
         held = sum(records.nbytes for records in self._casters.values())
-        while held > KEPT_BYTES:
+        while held > kept_bytes:
             held -= self._casters.popitem(last=False)[1].nbytes
         return plan, casters
 

@@ -99,12 +99,16 @@ class LiveState:
         """The boxes as ticks take them, the same tuple each time: another is looked at anew."""
         return tuple(entry.box for entry in self.boxes.values())
 
-    def with_player(self, added: LivePlayer) -> "LiveState":
-        """Another player. Raises TakenIdError, and InputError when there are too many."""
-        if added.player.id in self.players:
-            raise TakenIdError(f"player {added.player.id!r}: expected a new id, found one in use; delete that player first")
+    def expect_room_for(self, name: str) -> None:
+        """Raises TakenIdError where a player of that name is there, and InputError when there are too many."""
+        if name in self.players:
+            raise TakenIdError(f"player {name!r}: expected a new id, found one in use; delete that player first")
         if len(self.players) >= MAX_PLAYERS:
             raise InputError(f"players: expected at most {MAX_PLAYERS}, found as many already")
+
+    def with_player(self, added: LivePlayer) -> "LiveState":
+        """Another player. Raises as ``expect_room_for`` does."""
+        self.expect_room_for(added.player.id)
         return replace(self, players=MappingProxyType({**self.players, added.player.id: added}))
 
     def without_player(self, name: str) -> "LiveState":

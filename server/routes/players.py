@@ -58,6 +58,7 @@ async def add_player(
     def walking() -> LivePlayer:
         # Heights for GeoJSON, and streets to walk along, are read from files.
         player = player_from_json(body, "player", new_id=f"player-{secrets.token_hex(4)}", eye_height=live.lattice.eye_height)
+        ticker.state.expect_room_for(player.id)  # planning a walk may take a second
         return live.walking(player, 0, kept)
 
     entry = await asyncio.get_running_loop().run_in_executor(live.walkers, walking)
