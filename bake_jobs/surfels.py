@@ -128,8 +128,8 @@ def cluster(gbuffer: GBuffer, room: UInt16, origin: Float64, albedo: Float32, em
     coarse_cell = cell[of_fine_cell] >> level[:, None]
     surfel_key, surfel_of_fine = distinct(_key(coarse_cell, room_key[of_fine_cell], direction[of_fine_cell], level))
     of_hit = surfel_of_fine[fine_of_hit]
-    brick_of_surfel = np.cumsum(np.diff(surfel_key >> _BRICK_SHIFT, prepend=surfel_key[:1] >> _BRICK_SHIFT) != 0)
-    part = _seen_together(brick_of_surfel, of_hit, hit // gbuffer.rays)
+    _, cell_of_surfel = np.unique(surfel_key >> _BRICK_SHIFT, return_inverse=True)
+    part = _seen_together(cell_of_surfel, of_hit, hit // gbuffer.rays)
     by_part = np.argsort(part, kind="stable")
     surfel_key, part = surfel_key[by_part], part[by_part]
     of_hit = np.argsort(by_part)[of_hit]

@@ -98,7 +98,7 @@ class LightTrack:
 
     def _make(self, number: int, step_s: float, weather_at: WeatherAt) -> Lighting:
         moment = _EPOCH + timedelta(seconds=number * step_s)
-        # A clock that runs at 60 x makes three a second: kept, they would push out what queries ask for again and again.
+        # A clock that runs at 60 x makes two a second: kept, they would push out what queries ask for again and again.
         return self._lighting(moment, weather_at, keep=False)
 
     def _lighting(self, moment: datetime, weather_at: WeatherAt, keep: bool = True) -> Lighting:

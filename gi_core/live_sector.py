@@ -99,8 +99,8 @@ class LiveSector:
         self.has_other_source = False
         """Whether the next relight finds the sun's visibility from another source than the last did."""
         self._has_other_samples = False
-        """Whether it finds other samples than the last did. Even of nearly the same sun they may differ much from those before: more of a
-        tower's surfels lie on one map than on another."""
+        """Whether it finds other samples than the last did, as it does where the source is another. Even of nearly the same sun they may
+        differ much from those before: more of a tower's surfels lie on one map than on another."""
         self.lit_ahead: LiveLight | None = None
         """What ``light_ahead`` lit it by, and how far its light moved in the end."""
         self.moved_ahead = 0.0
@@ -303,7 +303,7 @@ class LiveSector:
         """Before a relight: forget samples that are too old for it, and where it finds others, have what is shown go over from what it
         was, if it is read."""
         self._expire_samples(light)
-        if not (self.has_other_source or self._has_other_samples):
+        if not self._has_other_samples:
             return
         self.has_other_source = self._has_other_samples = False
         if not is_read or (self._shown is None and self.is_fading):

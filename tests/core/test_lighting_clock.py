@@ -146,7 +146,7 @@ def test_a_standing_clock_can_jump_from_one_of_the_repeated_hours_to_the_other()
 
 
 def test_a_clock_that_runs_leaves_what_queries_asked_for_in_memory() -> None:
-    """At 60 x, a day makes twelve times as many as are kept."""
+    """At 60 x, a day makes ten times as many as are kept."""
     start = datetime(2024, 6, 1, 8, tzinfo=UTC)
     asked = make_lighting(Location(), start + timedelta(hours=1))
     kept = _make_lighting.cache_info().currsize
