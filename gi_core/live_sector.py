@@ -234,9 +234,9 @@ class LiveSector:
         self._take_cubes(relighter.converge(self.resident, light.given).cubes)
         return True
 
-    def advance(self, tick: int, must_show: bool, is_read: bool) -> None:
-        """Say whether what is shown changes at a tick: because its light has moved far enough, or is final, or gains are others
-        (``must_show``), or because it fades.
+    def advance(self, tick: int, must_show: bool, is_read: bool) -> float | None:
+        """Whether what is shown changes at a tick, and how far as a share of its brightest probe: because its light has moved far enough,
+        or wholly (1.0), because it is final or gains are others (``must_show``) or because it fades. None where it does not.
 
         A sector fades where something else was shown before: while no published volume reads it (``is_read``), it changes unseen.
         """
@@ -246,8 +246,11 @@ class LiveSector:
             else:
                 self._faded, self._shown = FADE_TICKS, None
             must_show = True
-        if must_show or self._unshown >= UNSHOWN_CHANGE:
-            self.shown_at, self._unshown = tick, 0.0
+        moved = 1.0 if must_show else self._unshown
+        if moved < UNSHOWN_CHANGE:
+            return None
+        self.shown_at, self._unshown = tick, 0.0
+        return moved
 
     def shown(self, settings: Settings, placeholder: Callable[[], Float32], basis: str) -> cl.Buffer:
         """The light to show, on the device, in a basis: the sector's own under the artists' gains, or while it fades a blend with what

@@ -19,16 +19,23 @@ from gi_core.grid import SectorIndex, volume_first_voxel
 from gi_core.live_sector import LiveSector
 from gi_core.live_volume import LiveVolume, ShownCubes, volume_arrays
 
+# Ticks that relight and fill volumes are the longest. So those that relight leave volumes in which light has moved by less than this share
+# since they were filled, a third of the finest step that an 8-bit sRGB picture shows, and those whose players have just moved on to other
+# voxels, for so many ticks.
+SEEN_CHANGE = 0.003
+MOST_PUT_OFF_TICKS = 3
 # A new player's first volume is held back until all of its sectors are there, but not for longer than two seconds at 30 Hz.
 HELD_TICKS = 60
 
 
 @dataclass(slots=True)
 class _Behind:
-    """A volume that has to be filled: since which tick, and how far from its player the nearest change is [m]."""
+    """A volume that has to be filled: since which tick, how far from its player the nearest change is [m], and how far light has moved at
+    most, as a share of the brightest."""
 
     since: int
     away_m: float
+    moved: float = 0.0
 
 
 class LiveVolumes:
@@ -85,21 +92,22 @@ class LiveVolumes:
                 self._fall_behind(name, tick, 0.0)
         self._places = dict(zip(ids, positions[:, [0, 2]].tolist(), strict=True))
 
-    def note(self, tick: int, changed: Sequence[SectorIndex]) -> None:
-        """Sectors show something else from this tick on: who reads them has to be filled."""
-        for index in changed:
+    def note(self, tick: int, changed: Mapping[SectorIndex, float]) -> None:
+        """Sectors show something else from this tick on, by a share of their brightest probe: who reads them has to be filled."""
+        for index, moved in changed.items():
             for name in self._readers.get(index, ()):
-                self._fall_behind(name, tick, _away_m(index, *self._places[name]))
+                self._fall_behind(name, tick, _away_m(index, *self._places[name])).moved += moved
 
     def fill(
-        self, tick: int, is_over: Callable[[], bool], shown: ShownCubes, placeholder: Callable[[SectorIndex], Float32]
+        self, tick: int, is_busy: bool, is_over: Callable[[], bool], shown: ShownCubes, placeholder: Callable[[SectorIndex], Float32]
     ) -> tuple[tuple[str, ...], int]:
         """Fill and publish volumes in the order of ``fill_plan``, at least one, until the time for it ``is_over``. While the device
-        fills one, the one before is published.
+        fills one, the one before is published. A tick that ``is_busy`` leaves those that nobody would miss.
 
         -> whose, and how many wait for another tick
         """
-        ready = [name for name in sorted(self._behind) if not self._is_held(name, tick)]
+        waiting = [name for name in sorted(self._behind) if not self._is_held(name, tick)]
+        ready = [name for name in waiting if not (is_busy and self._is_put_off(name, tick))]
         behind = [self._behind[name] for name in ready]
         order = fill_order(tick, np.array([b.since for b in behind], np.int64), np.array([b.away_m for b in behind], np.float64))
         filled: list[str] = []
@@ -123,11 +131,17 @@ class LiveVolumes:
             under_way = name
         if under_way is not None:
             publish(under_way)
-        return tuple(filled), len(ready) - len(filled)
+        return tuple(filled), len(waiting) - len(filled)
 
-    def _fall_behind(self, name: str, tick: int, away_m: float) -> None:
+    def _fall_behind(self, name: str, tick: int, away_m: float) -> _Behind:
         behind = self._behind.setdefault(name, _Behind(tick, away_m))
         behind.away_m = min(behind.away_m, away_m)
+        return behind
+
+    def _is_put_off(self, name: str, tick: int) -> bool:
+        """Whether a volume can wait for a tick with less to do."""
+        behind, is_new = self._behind[name], self.of_player[name].published is None
+        return not is_new and behind.moved < SEEN_CHANGE and tick < behind.since + MOST_PUT_OFF_TICKS
 
     def _unread(self, name: str, volume: LiveVolume) -> None:
         """A player's volume no longer reads what it read."""

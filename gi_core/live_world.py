@@ -6,7 +6,8 @@ A tick, in order:
                  one that has not settled exactly
     stream       while the device is at it, have volumes follow players, and plan loads and evictions for where they are and go; a tick that
                  has much to do leaves that to the next, for a while
-    volumes      of players who moved, or near whom something was relit, until the tick's time for it is spent; the rest wait
+    volumes      of players who moved, or near whom something was relit, until the tick's time for it is spent; the rest wait, and where
+                 the tick has relit something also those in which nothing has changed that anybody would see, for a while
     shadow map   draw some more of the next one; sectors take samples of one that was just drawn
 
 Lighting belongs to the world: players share lit sectors, only volumes are theirs. One thread calls ``tick``; what it publishes is
@@ -191,7 +192,7 @@ class LiveWorld:
         self.volumes.note(tick, changed)
         shown = partial(self._shown, light=light)
         report.filled, report.waiting = self.volumes.fill(
-            tick, lambda: time.perf_counter() - started >= fill_ms / 1e3, shown, self._placeholder
+            tick, bool(relit), lambda: time.perf_counter() - started >= fill_ms / 1e3, shown, self._placeholder
         )
         lap("volumes")
         self._step_shadows(players, light, boxes)
@@ -328,17 +329,17 @@ class LiveWorld:
             other = index in residents and residents[index].has_other_source
             self._needs.disturb(self._row[index], WHOLLY if other else BURST_CHANGE)
 
-    def _advance(self, tick: int, gains_changed: bool, report: TickReport) -> list[SectorIndex]:
-        """Sectors that show something else from this tick on, or are gone."""
-        residents, changed = self.streamer.residents, list(self._evicted)
+    def _advance(self, tick: int, gains_changed: bool, report: TickReport) -> dict[SectorIndex, float]:
+        """Sectors that show something else from this tick on, or are gone, and how far what they show moves, 1.0 being wholly."""
+        residents, changed = self.streamer.residents, dict.fromkeys(self._evicted, WHOLLY)
         self._evicted = ()
         # Others have shown what they show since they were looked at last.
         self._fading.update(report.loaded, report.relit, report.settled)
         for index in list(residents) if gains_changed else self._fading.intersection(residents):
             sector = residents[index]
-            sector.advance(tick, gains_changed or index in report.settled, index in self.volumes.looked_at)
-            if sector.shown_at == tick:
-                changed.append(index)
+            moved = sector.advance(tick, gains_changed or index in report.settled, index in self.volumes.looked_at)
+            if moved is not None:
+                changed[index] = moved
         self._fading = {index for index in self._fading.intersection(residents) if residents[index].is_fading}
         return changed
 

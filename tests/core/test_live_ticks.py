@@ -7,9 +7,11 @@ from itertools import count
 import numpy as np
 from live_run import EAST, GOLDEN, STREET, Run, at, light_of
 
+from gi_core.constants import VOXEL_SIZE_M
 from gi_core.dataset import Dataset
 from gi_core.grid import SectorIndex
 from gi_core.live_sector import UNSHOWN_CHANGE, LiveLight
+from gi_core.live_volumes import MOST_PUT_OFF_TICKS, SEEN_CHANGE
 from gi_core.live_world import LiveWorld, TickPlayers
 from gi_core.resident_sector import ResidentSector
 from gi_core.settings import NEUTRAL, Settings
@@ -31,13 +33,17 @@ def far_from_the_change(world, engine) -> tuple[TickPlayers, LiveLight]:
     return players, light
 
 
+def fill(world, light, tick, *, is_busy=False, is_over=lambda: False) -> tuple[tuple[str, ...], int]:
+    return world.volumes.fill(tick, is_busy, is_over, lambda sector: world._shown(sector, light), world._placeholder)
+
+
 def test_whose_own_sector_was_relit_is_served_first_and_nobody_is_forgotten(world, engine):
     players, light = far_from_the_change(world, engine)
     order = []
     for tick in range(1000, 1000 + len(players.ids)):
         world.volumes.follow(tick, players.ids, players.positions)
-        world.volumes.note(tick, [SectorIndex(-1, 0)] if tick == 1000 else [])
-        filled, waiting = world.volumes.fill(tick, lambda: True, lambda sector: world._shown(sector, light), world._placeholder)
+        world.volumes.note(tick, {SectorIndex(-1, 0): 1.0} if tick == 1000 else {})
+        filled, waiting = fill(world, light, tick, is_over=lambda: True)
         assert len(filled) == 1
         order += filled
         assert waiting == len(players.ids) - len(order)
@@ -49,10 +55,46 @@ def test_no_volume_is_begun_when_the_ticks_time_for_them_is_over(world, engine):
     players, light = far_from_the_change(world, engine)
     looks = count(1)
     world.volumes.follow(1000, players.ids, players.positions)
-    world.volumes.note(1000, [SectorIndex(0, 0)])
+    world.volumes.note(1000, {SectorIndex(0, 0): 1.0})
     # A second passes with each look at the clock: the first volume needs none, one begins at 1 s, another at 2 s, none at 3 s.
-    filled, waiting = world.volumes.fill(1000, lambda: next(looks) >= 3, lambda sector: world._shown(sector, light), world._placeholder)
+    filled, waiting = fill(world, light, 1000, is_over=lambda: next(looks) >= 3)
     assert (len(filled), waiting) == (3, 5)
+
+
+def test_ticks_that_relight_leave_volumes_that_show_no_change_for_a_while(world, engine):
+    players, light = far_from_the_change(world, engine)
+    one_went_on = players.positions.copy()
+    one_went_on[0, 0] += VOXEL_SIZE_M
+    world.volumes.follow(1000, players.ids, one_went_on)
+    world.volumes.note(1000, {SectorIndex(0, 0): 0.9 * SEEN_CHANGE})
+    for tick in range(1000, 1000 + MOST_PUT_OFF_TICKS):
+        assert fill(world, light, tick, is_busy=True) == ((), 8)
+    filled, waiting = fill(world, light, 1000 + MOST_PUT_OFF_TICKS, is_busy=True)
+    assert (sorted(filled), waiting) == (sorted(players.ids), 0)
+    world.volumes.note(1010, {SectorIndex(0, 0): 0.9 * SEEN_CHANGE, SectorIndex(-1, 0): SEEN_CHANGE})
+    assert len(fill(world, light, 1010, is_busy=True)[0]) == 8
+    world.volumes.note(1020, {SectorIndex(0, 0): 0.9 * SEEN_CHANGE})
+    assert len(fill(world, light, 1020, is_busy=False)[0]) == 8
+
+
+def test_a_drifting_sun_never_has_a_tick_relight_and_fill(world, engine):
+    run, start, both = Run(world), datetime(2024, 6, 21, 9), 0
+    run.settle(at(STREET), light_of(world, engine.lighting(start.isoformat(), "clear")))
+    relit = filled = 0
+    for tick in range(1, 121):
+        lighting = engine.lighting((start + timedelta(seconds=tick)).isoformat(), "clear")
+        report = run.tick(at(STREET), light_of(world, lighting, standing=False))
+        relit, filled, both = relit + bool(report.relit), filled + bool(report.filled), both + bool(report.relit and report.filled)
+    assert relit > 10
+    assert filled > 5
+    assert both == 0
+
+
+def test_what_is_seen_is_shown_by_the_tick_that_finds_it(world, engine):
+    players, _ = far_from_the_change(world, engine)
+    report = world.tick(1000, players, light_of(world, engine.lighting("12:30", "clear"), standing=False))
+    assert report.relit
+    assert len(report.filled) == len(players.ids)
 
 
 def test_without_any_time_left_two_sectors_are_relit_all_the_same(world, engine):
