@@ -165,6 +165,9 @@ ADAPTIVE: dict[str, Any] = {
     "voxel_candidates": 24,
     "margin_m": 3.2,
 }
+# What surfels send on under suns between those that are baked is most of what light errs by at a random hour: a quarter of the talk's steps
+# take a fifth off it, for a sixth more bytes and not a microsecond of a tick (docs/TRADEOFF.md, "Any sun").
+FINE_SUNS: dict[str, Any] = {"sun_declination_step_degrees": 8.0, "sun_hour_step_degrees": 7.5}
 
 
 def with_target_error(settings: BakeSettings, target_error: float) -> BakeSettings:
@@ -190,9 +193,11 @@ def settings_for(preset: str) -> BakeSettings:
         )
     if preset == "standard":
         # One feedback probe: with probes as close together as these, more of them were no better (MATH.md, "What each idea is worth").
-        # Cells that double from 4 m on: a fifth fewer bytes and a quarter off a tick, for no error that `tradeoff` can tell.
-        return BakeSettings(preset="standard", basis="sh2", sky="patches", sky_patches=96, cells_double_beyond_m=4.0, **ADAPTIVE)
+        # Cells that double from 4 m on: a fifth fewer bytes and a quarter off a tick, for no error that `tradeoff` can tell. Rays: as many
+        # bytes less as FINE_SUNS take.
+        less: dict[str, Any] = {"rays_per_face_edge": 12, "cells_double_beyond_m": 4.0}
+        return BakeSettings(preset="standard", basis="sh2", sky="patches", sky_patches=96, **less, **ADAPTIVE, **FINE_SUNS)
     if preset == "reference":
         more: dict[str, Any] = {"probe_worth": 0.001, "voxel_levels": 2, "reader_probes": 150}
-        return BakeSettings(preset="reference", basis="sh2", sky="patches", sky_patches=96, **more, **ADAPTIVE)
+        return BakeSettings(preset="reference", basis="sh2", sky="patches", sky_patches=96, **more, **ADAPTIVE, **FINE_SUNS)
     raise InputError(f"quality {preset!r}: expected one of {', '.join(PRESETS)}")

@@ -57,7 +57,7 @@ from gi_core.sector import Sector
 from gi_core.sun_table import SunTable
 
 # Part of the bake id: raised whenever the same settings would give other bytes than before.
-BAKER_VERSION = 8
+BAKER_VERSION = 9
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 SectorRange = tuple[tuple[int, int], tuple[int, int]]
 
@@ -134,7 +134,7 @@ def bake(
     for note in scene.notes:
         console.print(note, highlight=False, soft_wrap=True)
     table = SunTable.build(scene.location, settings.sun_declination_step_degrees, settings.sun_hour_step_degrees)
-    bake_id = _bake_id(scene, settings, seed)
+    bake_id = bake_identity(scene, settings, seed)
     wanted = _chosen(SectorCutter(scene).sectors(), sectors)
     with _writing(output):
         output.mkdir(parents=True, exist_ok=True)
@@ -214,7 +214,8 @@ def bake(
     return world
 
 
-def _bake_id(scene: Scene, settings: BakeSettings, seed: int) -> str:
+def bake_identity(scene: Scene, settings: BakeSettings, seed: int) -> str:
+    """Of what a bake's bytes depend on: bakes that share it would write the same."""
     h = hashlib.blake2b(digest_size=16)
     record = {
         "scene": scene_digest(scene),

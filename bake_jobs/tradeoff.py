@@ -19,7 +19,7 @@ from bake_jobs.compare_states import parse_states
 from bake_jobs.config import PRESETS, settings_for, with_knobs
 from bake_jobs.geometry_clip import SectorCutter
 from bake_jobs.path_tracer import Estimate
-from bake_jobs.runner import SectorRange, bake
+from bake_jobs.runner import SectorRange, bake, bake_identity
 from bake_jobs.scene import Scene
 from bake_jobs.tradeoff_ticks import tick_microseconds
 from gi_core.constants import SECTOR_SIZE_M
@@ -31,17 +31,17 @@ BASELINE = "standard"
 STATES = ("noon", "low_sun", "overcast")
 ON_SURFACES = "shaded"
 BLOCK = 2  # sectors along each side when none are named
-# Of BASELINE, one at a time.
+# Of BASELINE, one at a time, by group; a row may need another turned with it.
 KNOBS: dict[str, tuple[str, ...]] = {
-    "rays": ("rays_per_face_edge=8", "rays_per_face_edge=24"),
+    "rays": ("rays_per_face_edge=8", "rays_per_face_edge=16"),
     "cells": ("cells_double_beyond_m=2", "cells_double_beyond_m=8", "cells_double_beyond_m=16"),
-    "placement": ("placement=grid",),
+    "placement": ("placement=grid margin_m=4.75",),
     "spacing": ("probe_worth=0.03", "probe_worth=0.003", "target_error=0.05", "target_error=0.02"),
     "sky": ("sky=faces", "sky_patches=24", "sky_patches=48"),
     "feedback": ("feedback_probes=3", "far_feedback=closest"),
     "basis": ("basis=cube", "basis=sh1"),
     "voxels": ("voxel_weights=nearest", "wall_weights=nearest", "voxel_probes=2", "voxel_levels=2"),
-    "sun": ("sun_hour_step_degrees=7.5",),
+    "sun": ("sun_hour_step_degrees=15", "sun_declination_step_degrees=16", "sun_hour_step_degrees=3.75"),
 }
 TALK, IDEAS = "talk", "ideas"
 # What BASELINE adds to TALK, an idea at a time; and several feedback probes, which it left out again.
@@ -50,6 +50,8 @@ IDEA_KNOBS: tuple[tuple[str, ...], ...] = (
     ("cells_double_beyond_m=4",),
     ("basis=sh2",),
     ("placement=adaptive", "margin_m=3.2"),
+    ("rays_per_face_edge=12",),
+    ("sun_hour_step_degrees=7.5", "sun_declination_step_degrees=8"),
     ("voxel_weights=fitted", "voxel_candidates=24"),
     ("voxel_weights=fitted", "voxel_candidates=24", "wall_weights=fitted"),
     ("voxel_weights=fitted", "voxel_candidates=24", "far_feedback=likest"),
@@ -90,9 +92,9 @@ class Sweep:
 def plan(names: Sequence[str] = ()) -> list[Variant]:
     """Presets and KNOBS, or those with some names: a preset's, a group's of KNOBS, a knob's, or IDEAS. Raises InputError for others."""
     everything = [(preset, Variant(preset, preset)) for preset in PRESETS]
-    everything += [(group, Variant(f"{BASELINE} + {knob}", BASELINE, (knob,))) for group, knobs in KNOBS.items() for knob in knobs]
+    everything += [(group, _turned(BASELINE, tuple(knobs.split()))) for group, rows in KNOBS.items() for knobs in rows]
     if IDEAS in names:
-        everything += [(IDEAS, Variant(" + ".join((TALK, *knobs)), TALK, knobs)) for knobs in IDEA_KNOBS]
+        everything += [(IDEAS, _turned(TALK, knobs)) for knobs in IDEA_KNOBS]
     known = {name for group, variant in everything for name in (group, *variant.knobs)}
     unknown = [name for name in names if name not in known]
     if unknown:
@@ -100,6 +102,10 @@ def plan(names: Sequence[str] = ()) -> list[Variant]:
             f"--variants {unknown[0][:60]!r}: expected some of {', '.join((*PRESETS, *KNOBS, IDEAS))}, or a knob as in sky_patches=48"
         )
     return [variant for group, variant in everything if not names or {group, *variant.knobs} & set(names)]
+
+
+def _turned(preset: str, knobs: tuple[str, ...]) -> Variant:
+    return Variant(" + ".join((preset, *knobs)), preset, knobs)
 
 
 def middle_block(scene: Scene) -> SectorRange:
@@ -207,9 +213,10 @@ def error_of(states: dict[str, Any], stage: str) -> dict[str, float] | None:
 
 
 def pareto(rows: Sequence[dict[str, Any]], price: str) -> list[int]:
-    """Which rows no other row beats in both price and median error on surfaces, from the cheapest on."""
+    """Which rows no other row beats in both price and median error on surfaces, from the cheapest on; none that has no error."""
     best, front = np.inf, []
-    for number in sorted(range(len(rows)), key=lambda i: (rows[i][price], rows[i]["error"]["median"])):
+    judged = [number for number, row in enumerate(rows) if row["error"] is not None]
+    for number in sorted(judged, key=lambda i: (rows[i][price], rows[i]["error"]["median"])):
         if rows[number]["error"]["median"] < best:
             best = rows[number]["error"]["median"]
             front.append(number)
@@ -217,11 +224,14 @@ def pareto(rows: Sequence[dict[str, Any]], price: str) -> list[int]:
 
 
 def asked(sweep: Sweep, variant: Variant) -> dict[str, Any]:
-    """What decides a row's figures: a row of anything else is not this one's."""
+    """What decides a row's figures: a row of anything else, another version of the baker among it, is not this one's."""
     settings = settings_for(variant.preset)
+    if variant.knobs:
+        settings = with_knobs(settings, variant.knobs)
     judged = {"states": list(sweep.states), "points": sweep.points, "samples": sweep.samples, "seed": sweep.seed}
-    knobs = (with_knobs(settings, variant.knobs) if variant.knobs else settings).to_json()
-    return judged | {"source": sweep.source, "ranges": [list(axis) for axis in sweep.sectors], "settings": knobs}
+    ranges = [list(axis) for axis in sweep.sectors]
+    baked = {"settings": settings.to_json(), "bake": bake_identity(sweep.scene, settings, sweep.seed)}
+    return judged | {"source": sweep.source, "ranges": ranges} | baked
 
 
 def _finished(path: Path, sweep: Sweep, variant: Variant) -> dict[str, Any] | None:

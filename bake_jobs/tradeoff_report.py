@@ -19,6 +19,8 @@ STAGES = {
     "shaded_fine": "cascade -1",
 }
 PANEL, MARGIN, LEGEND_ROW = (430, 430), (52, 40, 16, 44), 15  # margin: left, top, right, bottom
+# Room for a label [pixels], and how far from its point its middle may be.
+LABEL, LABEL_DISTANCES = (14, 11), (16.0, 26.0, 38.0, 52.0, 68.0)
 PRESET_COLOURS = {"draft": "#888888", "talk": "#d08a3c", "standard": "#4878a8", "reference": "#5f9e5a"}
 FRONT = "#b85a5a"
 
@@ -112,7 +114,10 @@ def draw(rows: Sequence[Row], source: str) -> Image.Image:
 
 
 def _draw_panel(pen: ImageDraw.ImageDraw, left: int, rows: Sequence[Row], price: str, label: str, scale: float) -> None:
-    prices, errors = [row[price] * scale for row in rows], [100 * row["error"]["median"] for row in rows]
+    judged = [number for number, row in enumerate(rows) if row["error"] is not None]
+    if not judged:
+        return
+    prices, errors = [rows[n][price] * scale for n in judged], [100 * rows[n]["error"]["median"] for n in judged]
     x_of, y_of = _axis(prices, left + MARGIN[0], left + PANEL[0] - MARGIN[2]), _axis(errors, PANEL[1] - MARGIN[3], MARGIN[1])
     bottom, right = PANEL[1] - MARGIN[3], left + PANEL[0] - MARGIN[2]
     for value in _ticks(errors):
@@ -122,12 +127,27 @@ def _draw_panel(pen: ImageDraw.ImageDraw, left: int, rows: Sequence[Row], price:
         pen.line([(x_of(value), MARGIN[1]), (x_of(value), bottom)], fill="#dddddd")
         pen.text((x_of(value), bottom + 6), f"{value:g}", fill="black", anchor="ma")
     pen.text(((left + MARGIN[0] + right) / 2, bottom + 22), label, fill="black", anchor="ma")
-    points = [(x_of(p), y_of(e)) for p, e in zip(prices, errors, strict=True)]
-    pen.line([points[i] for i in pareto(rows, price)], fill=FRONT, width=2)
-    for number, (x, y) in enumerate(points):
+    points = {number: (x_of(p), y_of(e)) for number, p, e in zip(judged, prices, errors, strict=True)}
+    pen.line([points[number] for number in pareto(rows, price)], fill=FRONT, width=2)
+    for (number, (x, y)), (label_x, label_y) in zip(points.items(), _beside(list(points.values())), strict=True):
         colour = PRESET_COLOURS.get(rows[number]["preset"], "black")
+        if math.hypot(label_x - x, label_y - y) > LABEL_DISTANCES[0]:
+            pen.line([(x, y), (label_x, label_y)], fill="#bbbbbb")
         pen.ellipse([x - 4, y - 4, x + 4, y + 4], fill=colour)
-        pen.text((x + 6, y - 12), str(number + 1), fill=colour)
+        pen.text((label_x, label_y), str(number + 1), fill=colour, anchor="mm")
+
+
+def _beside(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Middles of the points' labels: as near as they go without covering a point or another label."""
+    taken = list(points)
+    found = []
+    for x, y in points:
+        steps = (1, 3, 5, 7, 0, 2, 4, 6)
+        ring = [(x + r * math.cos(math.pi * k / 4), y - r * math.sin(math.pi * k / 4)) for r in LABEL_DISTANCES for k in steps]
+        free = [at for at in ring if all(abs(at[0] - tx) >= LABEL[0] or abs(at[1] - ty) >= LABEL[1] for tx, ty in taken)]
+        found.append((free or ring)[0])
+        taken.append(found[-1])
+    return found
 
 
 def _axis(values: Sequence[float], start: float, end: float) -> Any:

@@ -2,16 +2,17 @@
 
 import json
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from bake_jobs import tradeoff
+from bake_jobs import runner, tradeoff
 from bake_jobs.config import PRESETS, settings_for, with_knobs
 from bake_jobs.scene_source import load_scene
-from bake_jobs.tradeoff import KNOBS, Sweep, Variant, error_of, middle_block, pareto, plan, run
-from bake_jobs.tradeoff_report import draw, table
+from bake_jobs.tradeoff import KNOBS, Sweep, Variant, asked, error_of, middle_block, pareto, plan, run
+from bake_jobs.tradeoff_report import LABEL, _beside, draw, table
 from gi_core.errors import InputError
 
 SOURCE = "procedural:midtown?blocks=1x1&seed=1"
@@ -30,7 +31,7 @@ def test_every_preset_and_each_knob_alone_is_planned():
     variants = plan()
     assert [v.name for v in variants[: len(PRESETS)]] == list(PRESETS)
     turned = [v for v in variants if v.knobs]
-    assert [v.knobs for v in turned] == [(knob,) for knobs in KNOBS.values() for knob in knobs]
+    assert [v.knobs for v in turned] == [tuple(knobs.split()) for group in KNOBS.values() for knobs in group]
     assert len({v.folder for v in variants}) == len(variants)
     standard = settings_for("standard")
     for variant in turned:
@@ -85,6 +86,31 @@ def test_the_table_and_the_plot_show_every_variant():
 def test_one_price_alike_for_all_is_no_trouble():
     draw([row("talk", 1, 0.05), row("standard", 1, 0.05)], "flat")
     draw([row("talk", 1, 0.05)], "one")
+
+
+def test_a_row_without_shaded_points_is_told_and_not_drawn():
+    blind = row("standard", 1, 0.01) | {"error": None}
+    rows = [row("talk", 1, 0.05), blind]
+    assert pareto(rows, "bytes") == [0]
+    assert "| standard | 300 |" in table(rows, "city.glb")
+    draw(rows, "city.glb")
+    draw([blind], "city.glb")
+
+
+def test_numbers_beside_dots_that_coincide_do_not():
+    places = np.array(_beside([(100.0, 100.0)] * 6 + [(108.0, 100.0)]))
+    apart = np.abs(places[:, None] - places[None])
+    assert all(x >= LABEL[0] or y >= LABEL[1] for i, j in combinations(range(len(places)), 2) for x, y in [apart[i, j]])
+
+
+def test_a_row_of_another_scene_or_baker_is_another(monkeypatch):
+    scene, other = load_scene(SOURCE), load_scene(SOURCE.replace("seed=1", "seed=2"))
+    (draft,) = plan(["draft"])
+    first = asked(Sweep(SOURCE, scene, ((0, 1), (0, 1))), draft)
+    assert asked(Sweep(SOURCE, scene, ((0, 1), (0, 1))), draft) == first
+    assert asked(Sweep(SOURCE, other, ((0, 1), (0, 1))), draft) != first
+    monkeypatch.setattr(runner, "BAKER_VERSION", runner.BAKER_VERSION + 1)
+    assert asked(Sweep(SOURCE, scene, ((0, 1), (0, 1))), draft) != first
 
 
 def test_the_middle_of_a_city_is_swept():

@@ -17,14 +17,16 @@ def test_a_knob_changes_one_setting_and_the_name():
 
 def test_standard_is_the_talk_and_its_ideas():
     placed = ["placement=adaptive", "voxel_weights=fitted", "wall_weights=fitted", "far_feedback=likest"]
-    placed += ["voxel_candidates=24", "margin_m=3.2"]
-    ideas = with_knobs(settings_for("talk"), ["basis=sh2", "sky=patches", "sky_patches=96", "cells_double_beyond_m=4", *placed]).to_json()
+    placed += ["voxel_candidates=24", "margin_m=3.2", "sun_hour_step_degrees=7.5", "sun_declination_step_degrees=8"]
+    fewer = ["cells_double_beyond_m=4", "rays_per_face_edge=12"]
+    ideas = with_knobs(settings_for("talk"), ["basis=sh2", "sky=patches", "sky_patches=96", *fewer, *placed]).to_json()
     assert settings_for("standard").to_json() | {"preset": ""} == ideas | {"preset": ""}
 
 
 def test_reference_is_standard_and_more_of_it():
     more = with_knobs(
-        settings_for("standard"), ["cells_double_beyond_m=8", "probe_worth=0.001", "voxel_levels=2", "reader_probes=150"]
+        settings_for("standard"),
+        ["cells_double_beyond_m=8", "rays_per_face_edge=16", "probe_worth=0.001", "voxel_levels=2", "reader_probes=150"],
     ).to_json()
     assert settings_for("reference").to_json() | {"preset": ""} == more | {"preset": ""}
 

@@ -348,11 +348,11 @@ def test_the_bake_id_names_scene_settings_seed_and_versions(source, monkeypatch)
     from bake_jobs.scene_source import load_scene
 
     scene = load_scene(source)
-    first = runner._bake_id(scene, settings_for("draft"), 0)
-    assert first == runner._bake_id(load_scene(source), settings_for("draft"), 0)
-    others = {runner._bake_id(scene, settings_for("talk"), 0), runner._bake_id(scene, settings_for("draft"), 1)}
+    first = runner.bake_identity(scene, settings_for("draft"), 0)
+    assert first == runner.bake_identity(load_scene(source), settings_for("draft"), 0)
+    others = {runner.bake_identity(scene, settings_for("talk"), 0), runner.bake_identity(scene, settings_for("draft"), 1)}
     monkeypatch.setattr(runner, "BAKER_VERSION", runner.BAKER_VERSION + 1)
-    others.add(runner._bake_id(scene, settings_for("draft"), 0))
+    others.add(runner.bake_identity(scene, settings_for("draft"), 0))
     assert len(others | {first}) == 4
 
 
