@@ -71,6 +71,7 @@ class Ranking:
     position : (R, 3) float64 [m], world frame; flags : (R,) uint8; room : (R,) uint16; cube : (R, S, 6) float32, trial light
     fixed : the first so many are asked for by hints or shared with neighbours, and stand whatever the budget says
     enough : the first so many are each worth it
+    dead : places that hints asked for, inside solids
     """
 
     position: Float64
@@ -79,13 +80,14 @@ class Ranking:
     cube: Float32
     fixed: int
     enough: int
+    dead: int = 0
 
     def first(self, count: int) -> tuple[Placement, Float32]:
         """The first ``count`` probes, and their trial light."""
         wanted = min(max(count, self.fixed), len(self.position))
         kept = np.arange(min(wanted, MAX_PROBES_PER_SECTOR))
         order = kept[stored_order(self.position[kept])]
-        placed = Placement(self.position[order], self.flags[order], self.room[order], 0, wanted - len(kept))
+        placed = Placement(self.position[order], self.flags[order], self.room[order], self.dead, wanted - len(kept))
         return placed, self.cube[order]
 
 
@@ -101,7 +103,7 @@ def rank_probes(
     trial: TrialScene,
 ) -> Ranking:
     """Probes for a sector, in the order in which they are worth having. With a target error more are ranked than are worth it."""
-    asked = _asked(index, settings, hints, rooms, solids)
+    asked, dead = _asked(ray_scene, index, settings, hints, rooms, solids)
     chosen, shared, enough = _choose(ray_scene, index, settings, hints, air, light, trial.states)
     position = np.concatenate([asked, air.centre[chosen] + np.array(OFF_EDGES_M)])
     height = np.concatenate([np.full(len(asked), np.inf), air.height[chosen]])
@@ -110,14 +112,22 @@ def rank_probes(
     local = position[:, [0, 2]] - index.origin[[0, 2]]
     flags[((local < 0) | (local >= SECTOR_SIZE_M)).any(axis=1)] |= PROBE_IN_MARGIN
     cube = np.concatenate([trial.light(asked).cube, light.cube[chosen]])
-    return Ranking(position, flags, rooms_of(position, rooms), cube, len(asked) + shared, len(asked) + enough)
+    return Ranking(position, flags, rooms_of(position, rooms), cube, len(asked) + shared, len(asked) + enough, dead)
 
 
-def _asked(index: SectorIndex, settings: BakeSettings, hints: tuple[ProbeHint, ...], rooms: tuple[Room, ...], solids: Solids) -> Float64:
-    """Positions (n, 3) [m] that hints ask for, in air."""
+def _asked(
+    ray_scene: RayScene,
+    index: SectorIndex,
+    settings: BakeSettings,
+    hints: tuple[ProbeHint, ...],
+    rooms: tuple[Room, ...],
+    solids: Solids,
+) -> tuple[Float64, int]:
+    """Positions (n, 3) [m] that hints ask for, in air; how many in solids of the sector they asked for."""
     low, high = index.origin[[0, 2]] - settings.margin_m, index.origin[[0, 2]] + SECTOR_SIZE_M + settings.margin_m
-    position = asked_positions(hints, low, high) + np.array(OFF_EDGES_M)
-    return position[~(solids.contain(position) & (rooms_of(position, rooms) == ROOM_OUTDOORS))]
+    position = asked_positions(ray_scene, hints, low, high, settings.wall_offset_m) + np.array(OFF_EDGES_M)
+    dead = solids.contain(position) & (rooms_of(position, rooms) == ROOM_OUTDOORS)
+    return position[~dead], int(dead.sum())
 
 
 def _choose(
@@ -139,7 +149,7 @@ def _choose(
     importance = _importance(air, light, hints, settings.band_m)
     # No light comes into closed solids that were not told for such: whatever stands there would explain nothing.
     importance[(light.cube[:, states.fitted].max(axis=2) < floor).all(axis=1)] = 0
-    may = (light.clearance >= CLEARANCE_M) & ~in_boxes(air.centre, [h for h in hints if h.kind == "forbid"])
+    may = (light.clearance >= CLEARANCE_M) & ~in_boxes(air.centre, hints, "forbid")
     worth = settings.probe_worth
     if settings.target_error:
         worth = WORTH_FOR_ERROR * (settings.target_error / WORTH_GIVES_ERROR) ** 2
@@ -187,7 +197,7 @@ def _importance(air: Air, light: TrialLight, hints: tuple[ProbeHint, ...], band_
     importance = 1 - (1 - HIGH_IMPORTANCE) * high
     importance[light.clearance > NEAR_SURFACE_M] *= OPEN_AIR_IMPORTANCE
     importance[air.room != ROOM_OUTDOORS] = 1.0
-    importance[in_boxes(air.centre, [h for h in hints if h.kind == "densify"])] *= DENSIFY
+    importance[in_boxes(air.centre, hints, "densify")] *= DENSIFY
     return importance
 
 

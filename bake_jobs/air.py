@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bake_jobs.config import BakeSettings
+from bake_jobs.config import FILL_MARGIN, BakeSettings
 from bake_jobs.inside import Solids
 from bake_jobs.rays import RayScene
-from bake_jobs.voxel_classes import FILL_MARGIN, solid_voxels
+from bake_jobs.voxel_classes import solid_voxels
 from gi_core.arrays import Bool, Float64, Int64, UInt16
 from gi_core.constants import ROOM_OUTDOORS, SECTOR_SIZE_M, VOXEL_SIZE_M
 from gi_core.grid import SectorIndex, voxel_centre, voxel_columns

@@ -1,10 +1,10 @@
 """What a bake may trade. A preset is a set of values of these knobs; the file format knows none of them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Literal, get_args
 
-from gi_core.constants import BASIS_SIZES, CUBE_FACES, MAX_SKY_PATCHES
+from gi_core.constants import BASIS_SIZES, CUBE_FACES, MAX_SKY_PATCHES, VOXEL_SIZE_M
 from gi_core.errors import InputError
 from gi_core.sector_file import MAX_BLENDED_PROBES
 from gi_core.sky_patches import MIN_PATCHES, SKY_SCHEMES
@@ -19,6 +19,10 @@ KNOB_CHOICES: dict[str, tuple[str, ...]] = {
     "wall_weights": ("nearest", "fitted"),
     "far_feedback": ("closest", "likest"),
 }
+# Columns of voxels beyond a sector's borders that the bake knows: solid voxels take the nearest air of these too, as the neighbour's own
+# would, and adaptive placement shares probes with neighbours no farther out.
+FILL_MARGIN = 2
+MAX_ADAPTIVE_MARGIN_M = FILL_MARGIN * VOXEL_SIZE_M
 # What a knob may be where it is not any length, angle or number of 0.01 to 10 000.
 KNOB_RANGES = {
     "sky_patches": (MIN_PATCHES, MAX_SKY_PATCHES),
@@ -127,7 +131,7 @@ class BakeSettings:
             del knobs["wall_weights"]
         if self.far_feedback == "closest" or self.voxel_weights == "nearest":
             del knobs["far_feedback"]
-        if not self.reader_probes:
+        if not self.reader_probes or "wall_weights" not in knobs or self.placement == "grid":
             del knobs["reader_probes"]
         return knobs
 
@@ -153,7 +157,27 @@ def with_knobs(settings: BakeSettings, knobs: Sequence[str]) -> BakeSettings:
             raise InputError(f"knob {knob[:60]!r}: expected {' or '.join(choices)}")
         if choices is None and not low <= float(value) <= high:
             raise InputError(f"knob {knob[:60]!r}: expected {low:g} to {high:g}")
-    return replace(settings, preset=", ".join([settings.preset, *knobs]), **turned)  # type: ignore[arg-type]
+    found = replace(settings, preset=", ".join([settings.preset, *knobs]), **turned)  # type: ignore[arg-type]
+    _expect_effect(found, turned)
+    return found
+
+
+def _expect_effect(settings: BakeSettings, turned: Mapping[str, object]) -> None:
+    """Raise InputError for a knob that was turned and that others leave without effect, and for a margin that placement cannot have."""
+    needs: dict[str, tuple[object, str, object]] = {
+        "wall_weights": ("fitted", "voxel_weights", "fitted"),
+        "far_feedback": ("likest", "voxel_weights", "fitted"),
+        "target_error": (turned.get("target_error"), "placement", "adaptive"),
+        "reader_probes": (turned.get("reader_probes") or None, "placement", "adaptive"),
+    }
+    for name, (value, other, wanted) in needs.items():
+        if turned.get(name) is not None and turned[name] == value and getattr(settings, other) != wanted:
+            raise InputError(f"knob {name}={value}: does nothing without {other}={wanted}")
+    if settings.placement == "adaptive" and settings.margin_m > MAX_ADAPTIVE_MARGIN_M:
+        raise InputError(
+            f"knob placement=adaptive: expected margin_m of {MAX_ADAPTIVE_MARGIN_M:g} at most, found {settings.margin_m:g}; "
+            f"as in margin_m={ADAPTIVE['margin_m']:g}"
+        )
 
 
 # What placement="adaptive" and voxel_weights="fitted" want of the other knobs: both tuned together (gi_core/MATH.md).
@@ -170,11 +194,18 @@ ADAPTIVE: dict[str, Any] = {
 FINE_SUNS: dict[str, Any] = {"sun_declination_step_degrees": 8.0, "sun_hour_step_degrees": 7.5}
 
 
-def with_target_error(settings: BakeSettings, target_error: float) -> BakeSettings:
-    """Settings that place probes adaptively until an error is met. Raises InputError for one that no bake can be asked for."""
+def with_target_error(settings: BakeSettings, target_error: float, knobs: Sequence[str] = ()) -> BakeSettings:
+    """Settings that place probes adaptively until an error is met; no other probes are added.
+
+    Raises InputError for an error that no bake can be asked for, and where ``knobs``, which were turned, are among those that it sets.
+    """
     if not 0.001 <= target_error <= 1.0:
         raise InputError(f"--target-error {target_error:g}: expected a relative error of 0.001..1, as in 0.04")
-    return replace(settings, **ADAPTIVE, target_error=target_error)
+    wanted = ADAPTIVE | {"target_error": target_error, "reader_probes": 0}
+    for name in (knob.partition("=")[0] for knob in knobs):
+        if name in wanted and getattr(settings, name) != wanted[name]:
+            raise InputError(f"--target-error: takes {name}={wanted[name]}, which the knob {name}={getattr(settings, name)} contradicts")
+    return replace(settings, **wanted)
 
 
 def settings_for(preset: str) -> BakeSettings:

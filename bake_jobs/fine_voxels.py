@@ -8,14 +8,14 @@ import numpy as np
 
 from bake_jobs.adaptive import NEAR_SURFACE_M, Trial
 from bake_jobs.air import Air
-from bake_jobs.config import BakeSettings
+from bake_jobs.config import FILL_MARGIN, BakeSettings
 from bake_jobs.inside import Solids
 from bake_jobs.placement import Placement
 from bake_jobs.rays import RayScene
 from bake_jobs.surface_fit import SurfaceFit
 from bake_jobs.trial_fit import TrialFit
 from bake_jobs.trial_light import TrialScene
-from bake_jobs.voxel_classes import FILL_MARGIN, solid_voxels
+from bake_jobs.voxel_classes import solid_voxels
 from bake_jobs.voxels import blend, nearest_lit, sector_lattice
 from gi_core.arrays import Bool, Float64, Int64, UInt16
 from gi_core.constants import FINE_VOXEL_SIZE_M, ROOM_OUTDOORS, VOXEL_INDOORS, VOXEL_OUTDOORS, VOXEL_SOLID

@@ -67,11 +67,11 @@ def place_probes(
     low, high = index.origin[[0, 2]] - reach, index.origin[[0, 2]] + SECTOR_SIZE_M + reach
     ground = _ground_candidates(ray_scene, bounds, low, high, settings)
     wall = _wall_candidates(ray_scene, bounds, low, high, settings)
-    asked = asked_positions(hints, low, high)
+    asked = asked_positions(ray_scene, hints, low, high, settings.wall_offset_m)
     position = np.concatenate([asked, ground, wall])
     flags = np.repeat(np.array([0, PROBE_ON_GROUND, PROBE_ON_WALL], np.uint8), [len(asked), len(ground), len(wall)])
 
-    allowed = ~in_boxes(position, [h for h in hints if h.kind == "forbid"])
+    allowed = ~in_boxes(position, hints, "forbid")
     position, flags = position[allowed], flags[allowed]
     room = rooms_of(position, rooms)
     # An authored room is air, whatever way its walls were modelled.
@@ -172,10 +172,14 @@ def _wall_levels(bounds: Float64, settings: BakeSettings) -> Float64:
 
 
 def _wall_candidates(ray_scene: RayScene, bounds: Float64, low: Float64, high: Float64, settings: BakeSettings) -> Float64:
-    levels = _wall_levels(bounds, settings)
+    return _beside_walls(ray_scene, _wall_levels(bounds, settings), low, high, settings.wall_spacing_m, settings.wall_offset_m)
+
+
+def _beside_walls(ray_scene: RayScene, levels: Float64, low: Float64, high: Float64, spacing_m: float, offset_m: float) -> Float64:
+    """Positions (n, 3) [m] off walls at some heights (l,) [m], from ``low`` to ``high`` (2,), x and z [m]."""
     found = []
     for axis, other in ((0, 1), (1, 0)):
-        y, line = (a.ravel() for a in np.meshgrid(levels, _lattice(low[other], high[other], settings.wall_spacing_m), indexing="ij"))
+        y, line = (a.ravel() for a in np.meshgrid(levels, _lattice(low[other], high[other], spacing_m), indexing="ij"))
         for sign in (1.0, -1.0):
             start = np.empty((len(y), 3))
             start[:, 1] = y
@@ -189,7 +193,7 @@ def _wall_candidates(ray_scene: RayScene, bounds: Float64, low: Float64, high: F
     normal = np.concatenate([n for _, n in found])
     air = ray_scene.closest(at + normal * SURFACE_OFFSET_M, normal.astype(np.float32))
     # In a gap narrower than twice the offset the probe stands in the middle.
-    offset = np.minimum(settings.wall_offset_m, np.minimum(air.distance, 1e6) / 2)
+    offset = np.minimum(offset_m, np.minimum(air.distance, 1e6) / 2)
     fits = offset > 0.3
     along_wall = np.stack([-normal[fits, 2], np.zeros(int(fits.sum())), normal[fits, 0]], axis=1)
     position = _pushed_off(ray_scene, at[fits] + normal[fits] * offset[fits, None], PULL_M[0] * along_wall)
@@ -198,23 +202,34 @@ def _wall_candidates(ray_scene: RayScene, bounds: Float64, low: Float64, high: F
     return position[order]
 
 
-def asked_positions(hints: tuple[ProbeHint, ...], low: Float64, high: Float64) -> Float64:
-    boxes = [np.empty((0, 3))]
+def asked_positions(ray_scene: RayScene, hints: tuple[ProbeHint, ...], low: Float64, high: Float64, wall_offset_m: float) -> Float64:
+    """Positions (n, 3) [m] that hints ask for, and none forbids, from ``low`` to ``high`` (2,), x and z [m]: lattices in boxes, and places
+    off whatever walls stand in boxes."""
+    found = [np.empty((0, 3))]
     for hint in hints:
-        if hint.kind != "add":
-            continue
-        x, y, z = (
-            _lattice(max(hint.minimum[a], bound_low), min(hint.maximum[a], bound_high), hint.spacing_m)
-            for a, bound_low, bound_high in ((0, low[0], high[0]), (1, -np.inf, np.inf), (2, low[1], high[1]))
-        )
-        boxes.append(np.stack([a.ravel() for a in np.meshgrid(x, y, z, indexing="ij")], axis=1))
-    return np.concatenate(boxes)
+        # What thins places off walls stands a little farther out, as it does for the neighbour.
+        reach = SAME_PLACE_M if hint.kind == "walls" else 0.0
+        x, z = ((max(hint.minimum[a], low[i] - reach), min(hint.maximum[a], high[i] + reach)) for i, a in enumerate((0, 2)))
+        y = hint.minimum[1], hint.maximum[1]
+        if hint.kind == "add":
+            lines = [_lattice(start, end, hint.spacing_m) for start, end in (x, y, z)]
+            found.append(np.stack([a.ravel() for a in np.meshgrid(*lines, indexing="ij")], axis=1))
+        elif hint.kind == "walls" and x[0] < x[1] and z[0] < z[1]:
+            corners = np.array([x[0], z[0]]), np.array([x[1], z[1]])
+            beside = _beside_walls(ray_scene, _lattice(*y, hint.spacing_m), *corners, hint.spacing_m, wall_offset_m)
+            # A wall askew is met along x and along z.
+            beside = beside[_thin(ray_scene, beside, np.zeros(len(beside), np.uint8))]
+            found.append(beside[((beside[:, [0, 2]] >= low) & (beside[:, [0, 2]] < high)).all(axis=1)])
+    position = np.concatenate(found)
+    return position[~in_boxes(position, hints, "forbid")]
 
 
-def in_boxes(position: Float64, boxes: list[ProbeHint]) -> Bool:
+def in_boxes(position: Float64, hints: tuple[ProbeHint, ...], kind: str) -> Bool:
+    """(n,) bool: which positions (n, 3) [m] lie in a box of the hints of a kind."""
     inside = np.zeros(len(position), bool)
-    for box in boxes:
-        inside |= ((position >= box.minimum) & (position <= box.maximum)).all(axis=1)
+    for box in hints:
+        if box.kind == kind:
+            inside |= ((position >= box.minimum) & (position <= box.maximum)).all(axis=1)
     return inside
 
 

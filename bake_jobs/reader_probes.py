@@ -12,7 +12,8 @@ from scipy.spatial import cKDTree
 
 from bake_jobs.adaptive import DARK, Trial
 from bake_jobs.config import BakeSettings
-from bake_jobs.placement import OFF_EDGES_M, Placement, stored_order
+from bake_jobs.placement import OFF_EDGES_M, Placement, in_boxes, stored_order
+from bake_jobs.scene import ProbeHint
 from bake_jobs.surface_fit import FINE_AREA_M2, SurfaceFit
 from bake_jobs.trial_light import TrialScene
 from gi_core.arrays import Bool, Float64, Int64
@@ -28,9 +29,16 @@ LEAST_ERROR = 0.5
 
 
 def add_probes(
-    surface_fit: SurfaceFit, index: SectorIndex, settings: BakeSettings, placed: Placement, trial: Trial, probe_scene: TrialScene
+    surface_fit: SurfaceFit,
+    index: SectorIndex,
+    settings: BakeSettings,
+    hints: tuple[ProbeHint, ...],
+    placed: Placement,
+    trial: Trial,
+    probe_scene: TrialScene,
 ) -> tuple[Placement, Trial]:
-    """Placement and trial light with at most ``settings.reader_probes`` more, which ``probe_scene`` lights."""
+    """Placement and trial light with at most ``settings.reader_probes`` more, none where hints forbid them, which ``probe_scene``
+    lights."""
     point, normal = surface_fit.both_sides(FINE_AREA_M2)
     place, found = surface_fit.in_air(point, normal, 0.5 * FINE_VOXEL_SIZE_M)
     place, normal = place[found], normal[found]
@@ -38,8 +46,7 @@ def add_probes(
     error = surface_fit.unexplained(place, normal, light)
     error[light.max(axis=(1, 2)) < DARK] = 0
     local = place[:, [0, 2]] - index.origin[[0, 2]]
-    may = ((local > settings.margin_m) & (local < SECTOR_SIZE_M - settings.margin_m)).all(axis=1)
-    may = np.asarray(may, np.bool_)
+    may = ((local > settings.margin_m) & (local < SECTOR_SIZE_M - settings.margin_m)).all(axis=1) & ~in_boxes(place, hints, "forbid")
     room = min(settings.probe_budget, MAX_PROBES_PER_SECTOR) - len(placed.position)
     chosen = worst_places(place, error, may, min(settings.reader_probes, room))
     if not len(chosen):

@@ -126,7 +126,7 @@ def bake(
     console = console or Console(stderr=True)
     settings = with_knobs(settings_for(quality), knobs) if knobs else settings_for(quality)
     if target_error is not None:
-        settings = with_target_error(settings, target_error)
+        settings = with_target_error(settings, target_error, knobs)
     if not 0 <= seed <= LARGEST_INTEGER:
         raise InputError(f"seed: expected a whole number of 0..{LARGEST_INTEGER}, found {seed}")
     expect_folder(output, "--output")

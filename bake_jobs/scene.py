@@ -26,8 +26,8 @@ class DroppedTriangles:
 
 @dataclass(frozen=True)
 class ProbeHint:
-    """A box in which the author wants probes added ("add", spaced by spacing_m), none ("forbid"), or more of those that adaptive placement
-    finds ("densify")."""
+    """A box in which the author wants probes added ("add", spaced by spacing_m), probes off every wall ("walls", spaced by it along the
+    wall and up), none ("forbid"), or more of those that adaptive placement finds ("densify")."""
 
     kind: str
     minimum: tuple[float, float, float]

@@ -15,6 +15,7 @@ from bake_jobs.inside import Solids
 from bake_jobs.path_tracer import PathTracer
 from bake_jobs.rays import RayScene
 from bake_jobs.reader_probes import add_probes
+from bake_jobs.sanity import expect_normals
 from bake_jobs.scene import Scene
 from bake_jobs.served_error import ServedError
 from bake_jobs.surface_fit import SurfaceFit
@@ -83,6 +84,7 @@ class SectorBaker:
         """All files of one sector."""
         geometry = self._cut(index)
         placed, trial, sector, meta = self._bake(index, geometry)
+        expect_normals(sector)
         sector_bytes = sector_file.encode(sector, meta, self._settings.sky_sources)
         fine = None
         if self._settings.voxel_levels > 1:
@@ -237,7 +239,7 @@ class SectorBaker:
         surface_fit = self._surface_fit(index, self._cut(index), placed, trial)
         if trial is None or surface_fit is None or self.trial is None:
             return placed, trial
-        return add_probes(surface_fit, index, self._settings, placed, trial, self.trial)
+        return add_probes(surface_fit, index, self._settings, self._scene.hints, placed, trial, self.trial)
 
 
 def _surfaces(geometry: Geometry) -> Float64:

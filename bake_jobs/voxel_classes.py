@@ -7,9 +7,6 @@ from bake_jobs.rays import RayScene
 from gi_core.arrays import Bool, Float64
 from gi_core.constants import VOXEL_SIZE_M
 
-# Solid voxels at a border take the nearest air of this many columns beyond it too, as the neighbour's own would.
-FILL_MARGIN = 2
-
 
 def solid_voxels(ray_scene: RayScene, solids: Solids, centre: Float64, voxel_size_m: float = VOXEL_SIZE_M) -> Bool:
     """(ny, nz, nx) bool: which voxel centres (ny, nz, nx, 3), ``voxel_size_m`` apart, lie in a solid.

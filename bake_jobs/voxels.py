@@ -18,13 +18,13 @@ from scipy.spatial import cKDTree
 
 from bake_jobs.adaptive import Trial
 from bake_jobs.blend_candidates import FADE_M, LEAST_DISTANCE_M, held_at_border, kept_at_border, to_border, visible
-from bake_jobs.config import BakeSettings
+from bake_jobs.config import FILL_MARGIN, BakeSettings
 from bake_jobs.inside import Solids
 from bake_jobs.placement import Placement
 from bake_jobs.rays import RayScene
 from bake_jobs.surface_fit import SurfaceFit
 from bake_jobs.trial_fit import TrialFit
-from bake_jobs.voxel_classes import FILL_MARGIN, solid_voxels
+from bake_jobs.voxel_classes import solid_voxels
 from gi_core.arrays import Bool, Float32, Float64, Int32, Int64, UInt8, UInt16
 from gi_core.constants import ROOM_OUTDOORS, VOXEL_INDOORS, VOXEL_OUTDOORS, VOXEL_SIZE_M, VOXEL_SOLID
 from gi_core.grid import SectorIndex, voxel_centre, voxel_columns

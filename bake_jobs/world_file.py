@@ -48,7 +48,7 @@ size = [1.8, 1.25, 4.6]                # width, height and length, along its own
 yaw_degrees = 30.0                     # counter-clockwise seen from above
 
 [[hint]]
-kind = "add"                           # add, forbid, or densify: more where light changes (adaptive placement)
+kind = "add"                           # add; walls: off every wall in the box; forbid; densify: more where light changes (adaptive)
 minimum = [0.0, 0.0, 0.0]
 maximum = [8.0, 4.0, 6.0]
 spacing_m = 2.0
@@ -68,13 +68,16 @@ from bake_jobs.mesh_source import MESH_SUFFIXES
 from bake_jobs.room_meshes import mesh_room
 from bake_jobs.scene import Mesh, ProbeHint, Search, SourceContent, join_meshes
 from bake_jobs.table import Table, read_toml
+from gi_core.constants import MAX_PROBES_PER_SECTOR, SECTOR_SIZE_M
 from gi_core.dataset import MAX_DECALS
 from gi_core.decals import MAX_SIZE_M, MAX_YAW_DEGREES, MIN_SIZE_M
 from gi_core.errors import SourceError
 from gi_core.room_records import MAX_ROOMS
 from gi_core.world import Decal, Location, Room
 
-HINT_KINDS = ("add", "forbid", "densify")
+HINT_KINDS = ("add", "walls", "forbid", "densify")
+# Places to try in one sector: most of a box may be solid.
+MOST_ASKED = 100 * MAX_PROBES_PER_SECTOR
 MAX_ROOM_M = 1000.0  # the largest halls; openings are looked for in every half metre or so of a room's faces
 Loader = Callable[[Path, MapFrame | None], SourceContent]
 
@@ -189,6 +192,15 @@ def _hint(table: Table) -> ProbeHint:
     minimum, maximum = _box(table)
     spacing = table.number("spacing_m", ProbeHint.spacing_m, 0.25, 1000.0)
     table.refuse_unknown()
+    # Of one sector: along both axes of walls, in all of a box to add to.
+    across = [min(maximum[axis] - minimum[axis], SECTOR_SIZE_M) / spacing for axis in (0, 2)]
+    up = (maximum[1] - minimum[1]) / spacing
+    asked = {"add": up * across[0] * across[1], "walls": up * sum(across)}.get(kind, 0.0)
+    if asked > MOST_ASKED:
+        raise SourceError(
+            f"{table.where}: asks for {asked:,.0f} probes in one sector, which holds {MAX_PROBES_PER_SECTOR}; "
+            "make spacing_m larger, or the box smaller"
+        )
     return ProbeHint(kind, minimum, maximum, spacing)
 
 

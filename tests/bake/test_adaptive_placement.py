@@ -187,6 +187,28 @@ def test_hints_add_forbid_and_densify(build, west_and_east):
     assert {tuple(p) for p in plain.tolist()} <= {tuple(p) for p in added.tolist()}
 
 
+def test_a_hint_has_probes_follow_the_faces_of_a_tower(build):
+    tower = build().ground().box((20, 0, 20), (36, 80, 36)).scene()
+    box = (14.0, 30.0, 14.0), (42.0, 78.0, 42.0)
+    hint = (ProbeHint("walls", *box, 6.0),)
+    for positions in (placed(replace(tower, hints=hint)).position, placed(replace(tower, hints=hint), placement="grid").position):
+        high = positions[within(positions, *box)]
+        off_face = np.maximum(np.abs(high[:, [0, 2]] - 28).max(axis=1) - 8, 0)
+        close = off_face < 1.5
+        assert ((off_face > 0.5) & close).sum() >= 4 * 2 * 8  # four faces, two or three along each, eight up
+        assert set(range(33, 76, 6)) <= set(np.round(high[close, 1]))
+    assert not within(placed(replace(tower, hints=(*hint, ProbeHint("forbid", *box)))).position, *box).any()
+
+
+def test_what_is_forbidden_beats_what_is_added_and_solids_are_told(build):
+    box = (10.0, 40.0, 10.0), (20.0, 44.0, 20.0)
+    hints = ProbeHint("add", *box, 2.0), ProbeHint("forbid", *box)
+    for knobs in ({}, {"placement": "grid"}):
+        assert not within(placed(replace(street(build), hints=hints), **knobs).position, *box).any()
+    tower = build().ground().box((20, 0, 20), (36, 80, 36)).scene()
+    assert placed(replace(tower, hints=(ProbeHint("add", (22.0, 10.0, 22.0), (34.0, 20.0, 34.0), 4.0),))).dead == 27
+
+
 def test_a_budget_is_kept_and_the_border_comes_first(build, west_and_east):
     all_of_it = west_and_east[1][0][0]
     budget = len(all_of_it.position) - 30

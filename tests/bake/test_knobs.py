@@ -2,7 +2,7 @@
 
 import pytest
 
-from bake_jobs.config import PRESETS, settings_for, with_knobs
+from bake_jobs.config import PRESETS, settings_for, with_knobs, with_target_error
 from gi_core.errors import InputError
 
 
@@ -63,5 +63,37 @@ def test_a_knob_that_does_nothing_is_not_part_of_a_bake():
     assert settings_for("talk").sky_sources == 6
     assert "voxel_levels" not in settings_for("standard").to_json()
     assert "wall_weights" not in settings_for("talk").to_json()
-    assert "far_feedback" not in with_knobs(settings_for("talk"), ["far_feedback=likest"]).to_json()
+    assert "far_feedback" not in with_knobs(settings_for("standard"), ["voxel_weights=nearest"]).to_json()
+    assert "reader_probes" in settings_for("reference").to_json()
+    assert "reader_probes" not in with_knobs(settings_for("reference"), ["wall_weights=nearest"]).to_json()
     assert {settings_for(name).preset for name in PRESETS} == set(PRESETS)
+
+
+@pytest.mark.parametrize(
+    ("preset", "knobs", "said"),
+    [
+        ("talk", ["wall_weights=fitted"], "wall_weights=fitted: does nothing without voxel_weights=fitted"),
+        ("talk", ["far_feedback=likest"], "far_feedback=likest: does nothing without voxel_weights=fitted"),
+        ("talk", ["target_error=0.05"], "target_error=0.05: does nothing without placement=adaptive"),
+        ("talk", ["reader_probes=20"], "reader_probes=20: does nothing without placement=adaptive"),
+        ("draft", ["placement=adaptive"], "expected margin_m of 6.25 at most, found 8.75; as in margin_m=3.2"),
+        ("standard", ["margin_m=7"], "expected margin_m of 6.25 at most, found 7"),
+    ],
+)
+def test_a_knob_without_effect_is_refused(preset, knobs, said):
+    with pytest.raises(InputError, match=said):
+        with_knobs(settings_for(preset), knobs)
+
+
+def test_what_turns_an_idea_off_may_leave_others_idle():
+    assert with_knobs(settings_for("standard"), ["voxel_weights=nearest"]).wall_weights == "fitted"
+    assert with_knobs(settings_for("reference"), ["reader_probes=0"]).reader_probes == 0
+
+
+def test_a_target_error_is_not_asked_for_with_a_knob_that_it_sets():
+    grid = ["placement=grid", "voxel_weights=nearest"]
+    with pytest.raises(InputError, match=r"--target-error: takes placement=adaptive, which the knob placement=grid contradicts"):
+        with_target_error(with_knobs(settings_for("standard"), grid), 0.05, grid)
+    rays = ["rays_per_face_edge=8", "voxel_weights=fitted"]
+    found = with_target_error(with_knobs(settings_for("reference"), rays), 0.05, rays)
+    assert (found.target_error, found.rays_per_face_edge, found.reader_probes) == (0.05, 8, 0)

@@ -16,6 +16,7 @@ from rich.console import Console
 
 from bake_jobs import runner
 from bake_jobs.runner import DatasetWriteError, bake
+from bake_jobs.sanity import NonsenseError
 from gi_core import distant_file
 from gi_core.dataset import Dataset, write_world
 from gi_core.errors import InputError, SourceError
@@ -393,3 +394,14 @@ def test_the_same_bake_once_more_keeps_its_error_report_and_any_other_drops_it(s
         reported(measured)
         run(source, tmp_path, **options)
         assert report() is None
+
+
+def test_a_bake_that_makes_no_sense_ships_no_dataset(source, tmp_path, monkeypatch):
+    def nonsense(*_):
+        raise NonsenseError("this bake is nonsense")
+
+    monkeypatch.setattr(runner, "expect_sense", nonsense)
+    with pytest.raises(NonsenseError):
+        run(source, tmp_path / "out")
+    assert list((tmp_path / "out" / "sectors").iterdir())
+    assert not (tmp_path / "out" / "world.json").exists()

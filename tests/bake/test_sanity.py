@@ -5,7 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bake_jobs.sanity import NonsenseError, expect_sense
+from bake_jobs.config import settings_for
+from bake_jobs.sanity import NonsenseError, expect_normals, expect_sense
+from bake_jobs.sector_job import SectorBaker
 from gi_core.dataset import SectorFacts
 from gi_core.grid import SectorIndex
 
@@ -33,7 +35,7 @@ def test_no_probe_and_nothing_at_all_make_sense(make_sector):
 
 
 def test_probes_that_see_only_sky_do_not(make_sector):
-    with pytest.raises(NonsenseError, match=r"its 40 probes see nothing but sky, and its sectors have triangles"):
+    with pytest.raises(NonsenseError, match=r"in 1 of 1 sectors 40 probes see nothing but sky, and there are triangles"):
         sense(make_sector(1), probes=40, surfels=0)
 
 
@@ -47,4 +49,25 @@ def test_surfels_without_a_normal_do_not(build, bake_arrays):
     sector, _ = bake_arrays(build().ground().scene(), **QUICK)
     for broken in (0.0, np.nan):
         with pytest.raises(NonsenseError, match="sector 0,0 has surfels without a normal"):
-            sense(replace(sector, surfel_normal=np.full_like(sector.surfel_normal, broken)))
+            expect_normals(replace(sector, surfel_normal=np.full_like(sector.surfel_normal, broken)))
+
+
+def test_a_baker_refuses_surfels_without_a_normal(build, monkeypatch):
+    scene = build().ground().scene()
+    baker = SectorBaker(scene, replace(settings_for("draft"), **QUICK), np.array([[0.0, 1.0, 0.0]]), "test")
+    sector, meta = baker.bake_arrays(HERE, baker.cutter.cut(HERE))
+    flat = replace(sector, surfel_normal=np.zeros_like(sector.surfel_normal))
+    monkeypatch.setattr(baker, "_bake", lambda *_: (None, None, flat, meta))
+    with pytest.raises(NonsenseError, match="sector 0,0 has surfels without a normal"):
+        baker.bake(HERE)
+
+
+def test_some_sectors_may_see_nothing_but_not_most(make_sector):
+    sector = make_sector(1)
+    rest = dict.fromkeys(("bytes", "geometry_bytes", "factors", "bricks", "voxels", "probes_dead", "probes_dropped", "voxels_blind"), 1)
+    seeing = SectorFacts(digest="", probes=sector.probe_count, surfels=sector.surfel_count, triangles=12, **rest)
+    facts = {SectorIndex(x, 0): seeing if x < 2 else replace(seeing, surfels=0) for x in range(5)}
+    with pytest.raises(NonsenseError, match=r"in 3 of 5 sectors [\d,]+ probes see nothing but sky"):
+        expect_sense(facts, lambda _: sector, 6)
+    facts[SectorIndex(2, 0)] = seeing
+    expect_sense(facts, lambda _: sector, 6)

@@ -127,7 +127,11 @@ WRONG = {
     "a search in words": (WORLD + '[rooms]\nfind = "yes"\n', r"\[rooms\]: find: expected true or false, found 'yes'"),
     "a search for closed rooms alone": (WORLD + "[rooms]\nclosed = true\n", r"\[rooms\]: closed: expected find = true with it"),
     "a search for more": (WORLD + "[rooms]\nfind = true\nsize = 3\n", r"\[rooms\]: unknown key size; expected find, closed"),
-    "a wish": (replaced('"forbid"', '"please"'), "kind: expected add or forbid"),
+    "a wish": (replaced('"forbid"', '"please"'), "kind: expected add or walls or forbid or densify"),
+    "a wish for too much": (
+        replaced('"forbid"', '"add"\nspacing_m = 0.25').replace("maximum = [1, 1, 1]", "maximum = [800, 90, 800]"),
+        r"asks for 23,592,960 probes in one sector, which holds \d+; make spacing_m larger, or the box smaller",
+    ),
     "north in words": (replaced("29.0", '"up"'), "north_degrees"),
     "no source": ("name = 'x'\n", "at least one"),
     "a source that is a table": ("[source]\npath = 'box.ply'\n", r"expected tables \[\[source\]\]"),

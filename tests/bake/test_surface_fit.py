@@ -7,6 +7,7 @@ import pytest
 
 from bake_jobs.config import ADAPTIVE, settings_for
 from bake_jobs.reader_probes import APART_M, worst_places
+from bake_jobs.scene import ProbeHint
 from bake_jobs.sector_job import SectorBaker
 from bake_jobs.surface_fit import _mixed, _spread
 from gi_core.basis import evaluate
@@ -135,3 +136,6 @@ def test_reader_probes_stand_in_air_within_the_margins(yards):
     assert ((new > 3.2) & (new < 60.8))[:, [0, 2]].all()
     bench = SectorBaker(yards, settings_for("talk"), SUNS[:1], "test")
     assert not bench._solids.contain(new + HERE.origin).any()
+    there = ProbeHint("forbid", (0.0, -1.0, 0.0), (64.0, 60.0, 64.0))
+    none = baked(replace(yards, hints=(there,)), "fitted", reader_probes=12)[2].probe_position
+    assert not ((none >= there.minimum) & (none <= there.maximum)).all(axis=1).any()
