@@ -19,7 +19,7 @@ from bake_jobs.choose import GAIN_STEP, Chooser, Pairs, neighbour_pairs
 from bake_jobs.config import BakeSettings
 from bake_jobs.distinct import distinct
 from bake_jobs.inside import Solids
-from bake_jobs.placement import OFF_EDGES_M, Placement, asked_positions, in_boxes, stored_order
+from bake_jobs.placement import OFF_EDGES_M, Placement, asked_positions, in_boxes, positions_between_voxels, stored_order
 from bake_jobs.rays import RayScene
 from bake_jobs.scene import ProbeHint
 from bake_jobs.trial_light import TrialLight, TrialScene
@@ -123,9 +123,10 @@ def _asked(
     rooms: tuple[Room, ...],
     solids: Solids,
 ) -> tuple[Float64, int]:
-    """Positions (n, 3) [m] that hints ask for, in air; how many in solids of the sector they asked for."""
+    """Positions (n, 3) [m] that hints ask for, and rooms between voxels, in air; how many more lie in solids."""
     low, high = index.origin[[0, 2]] - settings.margin_m, index.origin[[0, 2]] + SECTOR_SIZE_M + settings.margin_m
-    position = asked_positions(ray_scene, hints, low, high, settings.wall_offset_m) + np.array(OFF_EDGES_M)
+    hinted = asked_positions(ray_scene, hints, low, high, settings.wall_offset_m)
+    position = np.concatenate([hinted, positions_between_voxels(rooms, low, high)]) + np.array(OFF_EDGES_M)
     dead = solids.contain(position) & (rooms_of(position, rooms) == ROOM_OUTDOORS)
     return position[~dead], int(dead.sum())
 

@@ -13,9 +13,9 @@ from bake_jobs.inside import Solids
 from bake_jobs.rays import SURFACE_OFFSET_M, RayScene
 from bake_jobs.scene import ProbeHint
 from gi_core.arrays import Bool, Float64, Int64, UInt8, UInt16
-from gi_core.constants import MAX_PROBES_PER_SECTOR, ROOM_OUTDOORS, SECTOR_SIZE_M
-from gi_core.grid import SectorIndex
-from gi_core.rooms import rooms_of
+from gi_core.constants import MAX_PROBES_PER_SECTOR, ROOM_OUTDOORS, SECTOR_SIZE_M, VOXEL_SIZE_M
+from gi_core.grid import SectorIndex, voxel_centre
+from gi_core.rooms import holds, rooms_of
 from gi_core.sector import PROBE_IN_MARGIN, PROBE_ON_GROUND, PROBE_ON_WALL
 from gi_core.world import Room
 
@@ -30,6 +30,8 @@ PULL_M = (0.011, 0.007)
 # A wall probe closer than this to a probe that stands already would tell nothing new.
 WALL_MIN_DISTANCE_M = 3.0
 SAME_PLACE_M = 1.0
+# In rooms between voxels.
+APART_IN_ROOMS_M = 2 * VOXEL_SIZE_M
 # Cube-map rays run in ratios of odd numbers, and so do offsets from tidy walls: a ray from 0.5 m off a wall and 1.5 m up meets the very
 # edge where wall and floor join, and may report the floor behind. A few millimetres, in no such ratio, and no ray does.
 OFF_EDGES_M = (0.0037, 0.0053, 0.0029)
@@ -67,7 +69,9 @@ def place_probes(
     low, high = index.origin[[0, 2]] - reach, index.origin[[0, 2]] + SECTOR_SIZE_M + reach
     ground = _ground_candidates(ray_scene, bounds, low, high, settings)
     wall = _wall_candidates(ray_scene, bounds, low, high, settings)
-    asked = asked_positions(ray_scene, hints, low, high, settings.wall_offset_m)
+    asked = np.concatenate(
+        [asked_positions(ray_scene, hints, low, high, settings.wall_offset_m), positions_between_voxels(rooms, low, high)]
+    )
     position = np.concatenate([asked, ground, wall])
     flags = np.repeat(np.array([0, PROBE_ON_GROUND, PROBE_ON_WALL], np.uint8), [len(asked), len(ground), len(wall)])
 
@@ -222,6 +226,36 @@ def asked_positions(ray_scene: RayScene, hints: tuple[ProbeHint, ...], low: Floa
             found.append(beside[((beside[:, [0, 2]] >= low) & (beside[:, [0, 2]] < high)).all(axis=1)])
     position = np.concatenate(found)
     return position[~in_boxes(position, hints, "forbid")]
+
+
+def positions_between_voxels(rooms: tuple[Room, ...], low: Float64, high: Float64) -> Float64:
+    """Positions (n, 3) [m] in rooms that hold no voxel's centre, low storeys and closets, whose light probes alone can tell: every
+    APART_IN_ROOMS_M along each axis, or in the middle; from ``low`` to ``high`` (2,), x and z [m]."""
+    found = [np.empty((0, 3))]
+    for number, room in enumerate(rooms, 1):
+        box = np.array([room.minimum, room.maximum])
+        if (box[1, [0, 2]] < low).any() or (box[0, [0, 2]] >= high).any() or has_voxels(room):
+            continue
+        lines = [_lattice(start, end, APART_IN_ROOMS_M) for start, end in box.T]
+        lines = [line if len(line) else np.array([(start + end) / 2]) for line, (start, end) in zip(lines, box.T, strict=True)]
+        position = np.stack([a.ravel() for a in np.meshgrid(*lines, indexing="ij")], axis=1)
+        here = ((position[:, [0, 2]] >= low) & (position[:, [0, 2]] < high)).all(axis=1)
+        found.append(position[here & (rooms_of(position, rooms) == number)])
+    return np.concatenate(found)
+
+
+def has_voxels(room: Room) -> bool:
+    """Whether a room holds the centre of any voxel."""
+    low, high = (np.array(corner) / VOXEL_SIZE_M for corner in (room.minimum, room.maximum))
+    lines = [np.arange(int(np.ceil(start - 0.5)), int(np.floor(end - 0.5)) + 1) for start, end in zip(low, high, strict=True)]
+    if any(len(line) == 0 for line in lines):
+        return False
+    # Level by level: most rooms have one in their first.
+    for y in lines[1]:
+        lattice = np.stack([a.ravel() for a in np.meshgrid(lines[0], y, lines[2], indexing="ij")], axis=1)
+        if holds(room, voxel_centre(lattice)).any():
+            return True
+    return False
 
 
 def in_boxes(position: Float64, hints: tuple[ProbeHint, ...], kind: str) -> Bool:

@@ -41,7 +41,7 @@ ROOM_SLACK_M = 0.1
 FEEDBACK_STEPS = 15
 _HALF_RANGE = 1 << 15
 _HALF_HEIGHT = 1 << 12
-_ROOM_KEYS = 63  # rooms beyond share keys; two that share one share light only where one brick reaches into both
+_ROOM_KEYS = 63  # of rooms that a sector sees more, some share a key, and share light where one brick reaches into both
 _CELL_SHIFT = CELLS_PER_BRICK.bit_length() - 1
 _BRICK_SHIFT = 6  # of a surfel's key: what is left names its brick
 
@@ -112,7 +112,9 @@ def cluster(gbuffer: GBuffer, room: UInt16, origin: Float64, albedo: Float32, em
     local = gbuffer.position[hit] - origin
     normal = gbuffer.hits.normal[hit]
     direction = principal_direction(normal)
-    room_key = np.where(room[hit] == ROOM_OUTDOORS, 0, (room[hit].astype(np.int64) - 1) % _ROOM_KEYS + 1)
+    # Of the sector's own rooms: a city has hundreds.
+    _, room_key = np.unique(np.append(room[hit], np.uint16(ROOM_OUTDOORS)), return_inverse=True)
+    room_key = np.where(room_key[:-1] == 0, 0, (room_key[:-1] - 1) % _ROOM_KEYS + 1)
     cell = np.floor((local + normal * KEY_OFFSET_M) / SURFEL_CELL_M).astype(np.int64)
     for axis, half in enumerate((_HALF_RANGE, _HALF_HEIGHT, _HALF_RANGE)):
         if len(cell) and np.abs(cell[:, axis]).max() >= half * CELLS_PER_BRICK:

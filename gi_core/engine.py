@@ -2,7 +2,7 @@
 
 import threading
 from collections import OrderedDict
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +19,7 @@ from gi_core.constants import (
     VOLUME_SHAPE,
     VOXEL_INDOORS,
     VOXEL_NO_SECTOR,
+    VOXEL_SIZE_M,
     VOXEL_SOLID,
 )
 from gi_core.dataset import Dataset
@@ -259,6 +260,8 @@ class Engine:
 
         room : its name or number; None takes the room that the position lies in, or all rooms where it lies in none
 
+        A room that holds no voxel's centre has the light of its nearest probe at each voxel, and no voxel of the mask is its own.
+
         Raises InputError for a room that there is none of, and where the volume reaches no voxel or no probe of it; else as ``volume``.
         """
         rooms = self.dataset.world.rooms
@@ -288,13 +291,42 @@ class Engine:
                     ResidentGrid(self._device, grid).fill(box, target, resident.converted(basis), basis)
             self._device.read(target, values)
         inside = _in_room(lit_rooms, wanted)
+        sectors = tuple(box.index for box in boxes)
+        if wanted and not reached and (found := self._between_voxels(wanted, sectors, first, light, basis)) is not None:
+            values, lit = found
+            return Volume(values, mask, first, sectors, basis, residual=self._residual(lit, light), rooms=(wanted,))
         if not inside.any():
             there = f"room {rooms[wanted - 1].name!r}" if wanted else "a room"
             lacks = f"has no probe in {there}" if reached else f"reaches no voxel of {there}; GET /v1/world lists rooms"
             raise InputError(f"kind=interior: the volume around this place {lacks}")
         values = np.ascontiguousarray(values[(slice(None), *nearest(inside))])
-        sectors, residual = tuple(box.index for box in boxes), self._residual(lit, light)
-        return Volume(values, mask, first, sectors, basis, residual=residual, rooms=tuple(sorted(reached)))
+        return Volume(values, mask, first, sectors, basis, residual=self._residual(lit, light), rooms=tuple(sorted(reached)))
+
+    def _between_voxels(
+        self, room: int, sectors: Sequence[SectorIndex], first: Int64, light: _Light, basis: str
+    ) -> tuple[Float32, list[SectorIndex]] | None:
+        """Values of a volume in which each voxel has what the nearest probe of a room has, and the sectors that these are of; None where
+        there is none within the volume."""
+        places, cubes, lit = [], [], []
+        for index in sectors:
+            with self._lock:
+                sector = self._resident(index).sector
+                place = sector.probe_position / VOXEL_SIZE_M + index.origin / VOXEL_SIZE_M - 0.5 - first
+                within = ((place > -1) & (place < np.array(VOLUME_SHAPE)[[2, 0, 1]])).all(axis=1)
+                chosen = np.flatnonzero((sector.probe_room == room) & (sector.probe_flags & PROBE_IN_MARGIN == 0) & within)
+                if len(chosen):
+                    places.append(place[chosen])
+                    cubes.append(convert(self._lit_sector(index, light).cubes[chosen], self.dataset.world.basis, basis))
+                    lit.append(index)
+        if not lit:
+            return None
+        y, z, x = np.indices(VOLUME_SHAPE, np.float32)
+        closest, least = np.zeros(VOLUME_SHAPE, np.int64), np.full(VOLUME_SHAPE, np.inf, np.float32)
+        for number, (at_x, at_y, at_z) in enumerate(np.concatenate(places).astype(np.float32)):
+            squared = (x - at_x) ** 2 + (y - at_y) ** 2 + (z - at_z) ** 2
+            nearer = squared < least
+            closest[nearer], least[nearer] = number, squared[nearer]
+        return np.ascontiguousarray(np.moveaxis(np.concatenate(cubes)[closest], 3, 0), dtype=np.float32), lit
 
     def distant(self, lighting: Lighting, light: DistantLight | None = None) -> Distant:
         """One texel per sector of the whole world (slide "Distant shading").

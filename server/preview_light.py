@@ -9,7 +9,7 @@ A client has one volume, around its player; a picture may take as many as its pi
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -101,8 +101,9 @@ class ServedLight:
             inside = np.clip(position, low, high)
             try:
                 return engine.interior(inside, lighting, settings, room=str(room)) if room else engine.volume(inside, lighting, settings)
-            except InputError:  # a closet between voxels, or out of the one volume's reach
-                return engine.volume(inside, lighting, settings)
+            except InputError:  # a room without a probe, or out of the one volume's reach: nothing is known of it, the street's light least
+                outdoors = engine.volume(inside, lighting, settings)
+                return replace(outdoors, values=np.zeros_like(outdoors.values))
 
         distant = None if look.distant == "off" else engine.distant(settings.light(lighting), look.distant_light)
         world = engine.dataset.world

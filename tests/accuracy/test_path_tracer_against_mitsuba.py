@@ -1,4 +1,4 @@
-"""The judge's judge: Mitsuba 3, an independent path tracer, on two scenes. Both see the same mesh, sky and sun.
+"""The judge's judge: Mitsuba 3, an independent path tracer, on streets, two cities and a room. Both see the same mesh, sky and sun.
 
 Traps met on the way. Mitsuba's envmap looks along -Z at u = 0 and our sky along +X at column 0: a quarter turn. It interpolates
 texels where we take the nearest, so it is fed an enlarged map, constant but for a seam of one in ``SKY_ENLARGEMENT``. A directional
@@ -6,6 +6,7 @@ emitter's delta is never hit by the cosine rays of an irradiancemeter, so direct
 away from the light. Meters are rendered one at a time, each in its own scene.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import pytest
 from scipy import stats
 
 from bake_jobs.path_tracer import Estimate, PathTracer
+from bake_jobs.scene_source import load_scene
 from gi_core.ambient_cube import FACE_DIRECTIONS
 from gi_core.lighting import DirectionalLight, Lighting
 
@@ -21,7 +23,8 @@ mi = pytest.importorskip("mitsuba", reason="mitsuba is not installed: pip instal
 trimesh = pytest.importorskip("trimesh")
 pytestmark = pytest.mark.slow
 
-MUNICH = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "munich.glb"
+SHARED = Path(__file__).resolve().parents[2].parent / "shared" / "data"
+MUNICH, MIDTOWN = SHARED / "munich.glb", SHARED / "midtown.geojson"
 # What is left of the interpolation under the open sky: 0.06 % at 8, 0.04 % at 16, against noise of 0.05 to 0.14 % here.
 SKY_ENLARGEMENT = 16
 METER_SIZE_M = 1e-3
@@ -40,14 +43,14 @@ class Material:
     emission: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
+def block(size, at, turn=0.0, **material):
+    mesh = trimesh.creation.box(size)
+    mesh.apply_transform(trimesh.transformations.rotation_matrix(np.radians(turn), (0, 1, 0)))
+    return Material(mesh.vertices + np.asarray(at), np.asarray(mesh.faces), **material)
+
+
 def street():
     """Coloured blocks along a street that runs askew, an overhang, and a lamp: a closed box, so that it shines outwards only."""
-
-    def block(size, at, turn=0.0, **material):
-        mesh = trimesh.creation.box(size)
-        mesh.apply_transform(trimesh.transformations.rotation_matrix(np.radians(turn), (0, 1, 0)))
-        return Material(mesh.vertices + np.asarray(at), np.asarray(mesh.faces), **material)
-
     return [
         block((120, 1, 120), (0, -0.5, 0), albedo=(0.25, 0.22, 0.2)),
         block((30, 24, 12), (-2, 12, -14), 8, albedo=(0.6, 0.3, 0.2)),
@@ -56,6 +59,32 @@ def street():
         block((12, 1, 8), (2, 5, 3), albedo=(0.4, 0.4, 0.1)),
         block((1, 0.5, 1), (-8, 4, 0), albedo=(0.1, 0.1, 0.1), emission=(40_000.0, 30_000.0, 10_000.0)),
     ]
+
+
+def interior():
+    """A room of 12 x 4 x 10 m in walls of 0.3 m, with a window along one side, a door in another, and a ceiling lamp."""
+    wall, lamp = {"albedo": (0.7, 0.65, 0.55)}, {"albedo": (0.2, 0.2, 0.2), "emission": (9_000.0, 8_000.0, 6_000.0)}
+    return [
+        block((80, 1, 80), (0, -0.5, 0), albedo=(0.3, 0.35, 0.25)),
+        block((12.6, 0.3, 10.6), (0, 4.15, 0), albedo=(0.8, 0.8, 0.8)),
+        block((0.3, 4, 10.6), (6.15, 2, 0), **wall),
+        block((12.6, 4, 0.3), (0, 2, -5.15), **wall),
+        block((0.3, 0.5, 10.6), (-6.15, 0.25, 0), **wall),  # below the window, and above it
+        block((0.3, 0.4, 10.6), (-6.15, 3.8, 0), **wall),
+        block((4.9, 4, 0.3), (-3.85, 2, 5.15), **wall),  # to either side of the door, and above it
+        block((5.9, 4, 0.3), (3.35, 2, 5.15), **wall),
+        block((1.8, 1.6, 0.3), (-0.5, 3.2, 5.15), **wall),
+        block((2.0, 0.2, 2.0), (1, 3.85, 1), **lamp),
+    ]
+
+
+def midtown_crop(centre=(135.0, 185.0), reach_m=180.0):
+    """All triangles with a corner within ``reach_m`` of a point on an avenue, as the product reads the city, by albedo."""
+    scene = load_scene(str(MIDTOWN))
+    corners = scene.vertices[scene.triangles][:, :, [0, 2]]
+    near = (np.linalg.norm(corners - np.asarray(centre), axis=2) < reach_m).any(axis=1)
+    albedo, which = np.unique(scene.albedo[near], axis=0, return_inverse=True)
+    return [Material(scene.vertices, scene.triangles[near][which.ravel() == n], tuple(a)) for n, a in enumerate(albedo.tolist())]
 
 
 def munich_crop(centre=(-90.0, 60.0), reach_m=150.0):
@@ -99,7 +128,8 @@ def our_tracer(materials):
 
 
 class MitsubaJudge:
-    def __init__(self, materials, light, folder):
+    def __init__(self, materials, light, folder, samples):
+        self.samples = samples
         mi.set_variant("scalar_rgb")
         self.parts = {}
         for number, material in enumerate(materials):
@@ -145,19 +175,20 @@ class MitsubaJudge:
         sensor = {"type": "irradiancemeter", "film": film, "sampler": {"type": "independent"}}
         meter = {"type": "rectangle", "to_world": pose @ mi.ScalarTransform4f().scale(METER_SIZE_M / 2), "sensor": sensor}
         scene = mi.load_dict({"type": "scene", "integrator": {"type": "path"}, **self.parts, "meter": meter})
-        spp = MITSUBA_SAMPLES // REPLICATES
+        spp = self.samples // REPLICATES
         return [np.array(mi.render(scene, spp=spp, seed=seed)).reshape(3) for seed in range(REPLICATES)]
 
 
-def open_air_receivers(tracer, low, high, count, seed):
-    """Points in a box that see some sky: in air (count, 3), and where a ray from them first meets a surface, with normals."""
+def receivers(tracer, low, high, count, seed, most_blocked=0.8):
+    """Points in a box from which at most so much of the sky is hidden: in air (count, 3), and where a ray from them first meets a surface,
+    with normals."""
     rng = np.random.default_rng(seed)
-    points = rng.uniform(low, high, (count * 8, 3))
+    points = rng.uniform(low, high, (count * 16, 3))
     upward = rng.normal(size=(32, 3))
     upward[:, 1] = np.abs(upward[:, 1])
     upward /= np.linalg.norm(upward, axis=1, keepdims=True)
     blocked = tracer.rays.occluded(np.repeat(points, 32, axis=0), np.tile(upward, (len(points), 1))).reshape(-1, 32)
-    points = points[blocked.mean(axis=1) < 0.8][:count]
+    points = points[blocked.mean(axis=1) <= most_blocked][:count]
     ray = rng.normal(size=(count, 3))
     ray[:, 1] = -np.abs(ray[:, 1]) - 0.3  # steep enough to end on the ground at the latest
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
@@ -186,21 +217,37 @@ def compare(ours, theirs, title):
     assert bias_noise < 0.003  # or agreement would mean little
 
 
-@pytest.mark.parametrize("city", ["street", "munich"])
-def test_agrees_with_mitsuba_within_noise(city, tmp_path):
-    if city == "street":
-        materials, low, high = street(), (-20, 0.5, -7), (20, 20, 7)
-    else:
-        if not MUNICH.exists():
-            pytest.skip(f"needs the shared city {MUNICH.name}")
-        materials, low, high = munich_crop(), (-122, 2, 28), (-58, 25, 92)
+@dataclass
+class Case:
+    materials: Callable[[], list[Material]]
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+    needs: Path | None = None
+    most_blocked: float = 0.8
+    effort: int = 1
+
+
+CASES = {
+    "street": Case(street, (-20, 0.5, -7), (20, 20, 7)),
+    "munich": Case(munich_crop, (-122, 2, 28), (-58, 25, 92), MUNICH),
+    "midtown": Case(midtown_crop, (105, 2, 155), (165, 25, 215), MIDTOWN),
+    "interior": Case(interior, (-5, 0.5, -4), (5, 3.5, 4), most_blocked=1.0, effort=3),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_agrees_with_mitsuba_within_noise(name, tmp_path):
+    case = CASES[name]
+    if case.needs is not None and not case.needs.exists():
+        pytest.skip(f"needs the shared city {case.needs.name}")
+    materials = case.materials()
     light, tracer = daylight(), our_tracer(materials)
-    air, surface, normals = open_air_receivers(tracer, low, high, count=10, seed=7)
-    judge = MitsubaJudge(materials, light, tmp_path)
+    air, surface, normals = receivers(tracer, case.low, case.high, count=10, seed=7, most_blocked=case.most_blocked)
+    judge = MitsubaJudge(materials, light, tmp_path, case.effort * MITSUBA_SAMPLES)
 
-    ours = tracer.cube_irradiance(air, light, samples=OUR_SAMPLES, replicates=REPLICATES)
+    ours = tracer.cube_irradiance(air, light, samples=case.effort * OUR_SAMPLES, replicates=REPLICATES)
     six = judge.irradiance(np.repeat(air, 6, axis=0), np.tile(FACE_DIRECTIONS.astype(np.float64), (len(air), 1)))
-    compare(ours, Estimate(six.mean.reshape(-1, 6, 3), six.standard_error.reshape(-1, 6, 3)), f"{city}, six faces in air")
+    compare(ours, Estimate(six.mean.reshape(-1, 6, 3), six.standard_error.reshape(-1, 6, 3)), f"{name}, six faces in air")
 
-    ours = tracer.surface_irradiance(surface, normals, light, samples=OUR_SAMPLES, replicates=REPLICATES)
-    compare(ours, judge.irradiance(surface + 2e-3 * normals, normals), f"{city}, on surfaces")
+    ours = tracer.surface_irradiance(surface, normals, light, samples=case.effort * OUR_SAMPLES, replicates=REPLICATES)
+    compare(ours, judge.irradiance(surface + 2e-3 * normals, normals), f"{name}, on surfaces")
