@@ -101,7 +101,7 @@ def _world_vertices(document: dict[str, Any], path: Path, frame: MapFrame | None
     try:
         stored = np.array(document["vertices"], np.float64).reshape(-1, 3)
         real = stored * np.array(transform["scale"], np.float64) + np.array(transform["translate"], np.float64)
-    except (TypeError, ValueError, KeyError) as error:
+    except (TypeError, ValueError, KeyError, OverflowError) as error:
         raise SourceError(f"{path}: expected vertices of three numbers and a transform with scale and translate ({error})") from error
     if not len(real):
         raise SourceError(f"{path}: expected vertices, found none")
@@ -142,7 +142,7 @@ def _polygons(document: dict[str, Any], vertex_count: int, path: Path) -> Iterat
                 yield _Polygon(indices, surface if surface in SURFACE_ALBEDO else kind, kind in BUILDINGS, number)
         except SourceError:
             raise
-        except (TypeError, ValueError, KeyError, AttributeError, IndexError) as error:
+        except (TypeError, ValueError, KeyError, AttributeError, IndexError, OverflowError) as error:
             raise SourceError(f"{path}: object {name!r}: expected CityJSON geometry ({error})") from error
 
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Literal, get_args
 
-from gi_core.constants import BASIS_SIZES, CUBE_FACES, MAX_SKY_PATCHES, VOXEL_SIZE_M
+from gi_core.constants import BASIS_SIZES, CUBE_FACES, MAX_PROBES_PER_SECTOR, MAX_SKY_PATCHES, VOXEL_SIZE_M
 from gi_core.errors import InputError
 from gi_core.sector_file import MAX_BLENDED_PROBES
 from gi_core.sky_patches import MIN_PATCHES, SKY_SCHEMES
@@ -30,6 +30,11 @@ KNOB_RANGES = {
     "voxel_probes": (1, MAX_BLENDED_PROBES),
     "voxel_candidates": (1, 256),
     "rays_per_face_edge": (2, 256),
+    "trial_rays_per_face_edge": (2, 64),
+    "fit_candidates": (1, 256),
+    "probe_budget": (1, MAX_PROBES_PER_SECTOR),
+    "grid_spacing_m": (0.5, 1e3),
+    "wall_spacing_m": (0.5, 1e3),
     "voxel_levels": (1, 2),
     "reader_probes": (0, 1000),
     "probe_worth": (1e-5, 1e4),

@@ -7,6 +7,7 @@ system that the file's ``crs`` member names.
 """
 
 import re
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -136,7 +137,7 @@ def _polygons(geometry: Any, where: str) -> Iterator[tuple[Float64, ...]]:
                     yield tuple(ring.reshape(-1, 2) for ring in rings if len(ring) >= 3)
     except SourceError:
         raise
-    except (TypeError, ValueError, IndexError, KeyError) as error:
+    except (TypeError, ValueError, IndexError, KeyError, OverflowError) as error:
         raise SourceError(f"{where}: expected rings of [longitude, latitude] numbers ({error})") from error
 
 
@@ -163,7 +164,7 @@ def _metres(properties: dict[str, Any], key: str, where: str) -> float | None:
         return None
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise SourceError(f"{where}: expected {key} to be a number of metres, found {value!r}")
-    return float(value) if np.isfinite(value) else None
+    return float(value) if abs(value) <= sys.float_info.max else None
 
 
 def _refuse_bad_places(lonlat: Float64, path: Path) -> None:
@@ -226,7 +227,7 @@ def _extrude(polygons: Any, parts: list[_Part], ground: Float64) -> list[Mesh]:
 def wall_albedo(building: str) -> Float32:
     """(3,) float32, linear sRGB: the same for a name on every machine; Python's own hash is not."""
     state = 0xCBF29CE484222325  # FNV-1a, 64 bit
-    for byte in building.encode():
+    for byte in building.encode(errors="replace"):
         state = (state ^ byte) * 0x100000001B3 & 0xFFFFFFFFFFFFFFFF
     state = (state ^ state >> 29) * 0xBF58476D1CE4E5B9 & 0xFFFFFFFFFFFFFFFF
     colour = np.array(WALL_PALETTE[(state >> 40) % len(WALL_PALETTE)], np.float32)

@@ -48,7 +48,7 @@ def lonlat_from(points: Float64, system: str, where: str) -> Float64:
         if not (horizontal.is_geographic or horizontal.is_projected):
             raise ProjError(f"it is a {crs.type_name}")
         x, y = Transformer.from_crs(horizontal, "EPSG:4326", always_xy=True).transform(points[:, 0], points[:, 1])
-    except ProjError as error:
+    except (ProjError, UnicodeError) as error:
         raise SourceError(
             f"{where}: expected a coordinate system of maps that PROJ knows, as EPSG:4326, found {system[:80]!r} ({str(error)[:200]})"
         ) from error

@@ -19,11 +19,12 @@ from gi_core.decals import check_decal
 from gi_core.distant_file import DistantTexels
 from gi_core.errors import CorruptFileError, FormatVersionError, InputError, SectorMissingError
 from gi_core.geometry_file import Geometry
-from gi_core.grid import SectorIndex
+from gi_core.grid import MAX_SECTOR_NUMBER, SectorIndex
 from gi_core.json_fields import Fields, all_finite
 from gi_core.lights import MAX_LUMENS, check_lamp
 from gi_core.room_records import DOORS_VERSION, ROOMS_VERSION, needs_doors_version, read_rooms, room_json
 from gi_core.sector import Sector
+from gi_core.sector_file import MAX_BLENDED_PROBES
 from gi_core.sky_patches import MIN_PATCHES, SKY_SCHEMES
 from gi_core.sun_table import SunTable
 from gi_core.voxel_grid import VoxelGrid
@@ -38,8 +39,6 @@ DISTANT_FILE = "distant.gidist"
 MAX_WORLD_BYTES = 1 << 28
 # 62 500 km2 of city; a reader refuses more before it makes room for it.
 MAX_SECTORS = 1 << 24
-# 64 000 km from the origin.
-MAX_SECTOR_COORDINATE = 1_000_000
 MAX_LAMPS = 1 << 20
 # Six times the talk's 22 300 vehicles.
 MAX_DECALS = 1 << 17
@@ -184,6 +183,10 @@ class WorldInfo:
         basis, sky, patches = _directions(top, found)
         low, high = _corners(top)
         report = None if record["error_report"] is None else top.mapping("error_report")
+        settings = top.fields("settings")
+        for name in ("voxel_probes", "feedback_probes"):  # streaming plans go by them
+            if settings.has(name):
+                settings.integer(name, 1, MAX_BLENDED_PROBES)
         if not all_finite([report, top.mapping("settings")]):
             raise CorruptFileError(f"{where}: settings or error_report hold a number or a text that JSON has no place for; bake it again")
         if report is not None and "expected_error" in report:
@@ -232,7 +235,7 @@ def _sectors(top: Fields, version: int) -> dict[SectorIndex, SectorFacts]:
     for key, record in records.items():
         match = _SECTOR_KEY.fullmatch(key)
         # One spelling for each sector: neither 01,0 nor -0,0.
-        if match is None or f"{int(match[1])},{int(match[2])}" != key or max(abs(int(n)) for n in match.groups()) > MAX_SECTOR_COORDINATE:
+        if match is None or f"{int(match[1])},{int(match[2])}" != key or max(abs(int(n)) for n in match.groups()) > MAX_SECTOR_NUMBER:
             raise CorruptFileError(f"{top.where}: sectors: expected keys such as 3,-2, found {key[:40]!a}; bake it again")
         given = optional & set(record) if isinstance(record, dict) else frozenset()
         facts = Fields(record, f"{top.where}: sectors: {key}", {*COUNTS, "digest", *given})
@@ -381,6 +384,8 @@ class Dataset:
             raise CorruptFileError(
                 f"{path}: {sector.basis_size} coefficients, expected {BASIS_SIZES[world.basis]} of {world.basis}; bake it again"
             )
+        if max(int(sector.voxel_room.max(initial=0)), int(sector.probe_room.max(initial=0))) > len(world.rooms):
+            raise CorruptFileError(f"{path}: expected rooms of 1 to {len(world.rooms)}; bake it again")
         # The device holds as many patches as world.json says; the file was checked against its own number.
         if int(sector.factor_source.max(initial=0)) >= sector.brick_count + world.sky_patches:
             raise CorruptFileError(f"{path}: expected factors of {world.sky_patches} sky patches at most; bake it again")
@@ -407,7 +412,8 @@ class Dataset:
             raise CorruptFileError(f"{path}: {error.strerror}; bake it again") from error
         if found != sector.index or bake_id != self.world.bake_id:
             raise CorruptFileError(f"{path}: holds sector {found}{_other_bake(bake_id, self.world)}; bake it again")
-        if voxels.weight.any() and int(voxels.probe.max()) >= sector.probe_count:
+        # What weighs nothing is read as well.
+        if int(voxels.probe.max(initial=0)) >= max(sector.probe_count, 1):
             raise CorruptFileError(f"{path}: expected voxels of {sector.probe_count} probes; bake it again")
         return voxels
 

@@ -12,7 +12,7 @@ from gi_core import container, quantise
 from gi_core.arrays import AnyArray
 from gi_core.constants import FINE_VOXEL_SIZE_M, MAX_PROBES_PER_SECTOR, VOXEL_INDOORS
 from gi_core.errors import CorruptFileError
-from gi_core.grid import SectorIndex, voxel_columns
+from gi_core.grid import SectorIndex, sector_index, voxel_columns
 from gi_core.sector_file import MAX_BLENDED_PROBES
 from gi_core.voxel_grid import VoxelGrid
 
@@ -40,7 +40,7 @@ def decode(data: bytes, where: str) -> tuple[VoxelGrid, SectorIndex, str]:
     found = container.decode(data, KIND, VERSION, where)
     try:
         found.refuse_unknown(frozenset({"sector", "voxel_first", "bake_id"}), _ARRAYS)
-        index, bake_id = SectorIndex(*(int(v) for v in found.meta["sector"])), str(found.meta["bake_id"])
+        index, bake_id = sector_index(found.meta["sector"]), str(found.meta["bake_id"])
         kind, probe, share = found.take("voxel_class", "u1", 3), found.take("voxel_probe", "u2", 4), found.take("voxel_weight", "u1", 4)
         first = np.array([int(v) for v in found.meta["voxel_first"]], np.int32)
     except CorruptFileError as error:

@@ -8,7 +8,7 @@ import numpy as np
 from gi_core import container, quantise
 from gi_core.arrays import AnyArray, Float32, Float64, Int32
 from gi_core.errors import CorruptFileError
-from gi_core.grid import SectorIndex
+from gi_core.grid import SectorIndex, sector_index
 
 KIND = "GEOM"
 VERSION = 1
@@ -61,7 +61,7 @@ def decode(data: bytes, where: str) -> tuple[Geometry, SectorIndex, str]:
     found = container.decode(data, KIND, VERSION, where)
     try:
         found.refuse_unknown(frozenset({"sector", "bake_id"}), _ARRAYS)
-        index, bake_id = SectorIndex(*(int(v) for v in found.meta["sector"])), str(found.meta["bake_id"])
+        index, bake_id = sector_index(found.meta["sector"]), str(found.meta["bake_id"])
         vertex, triangle = found.take("vertex", "i4", 2), found.take("triangle", "i4", 2)
         material = found.take("material", "u4", 1)
         albedo, emission = found.take("material_albedo", "u1", 2), found.take("material_emission", "f4", 2)

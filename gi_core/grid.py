@@ -5,6 +5,7 @@ holds its centre. 64 m is 20.48 voxels, so a sector owns 20 or 21 voxel columns 
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +14,7 @@ from gi_core.arrays import Float64, Int64
 from gi_core.constants import SECTOR_SIZE_M, VOLUME_SHAPE, VOXEL_SIZE_M
 
 # Voxels along x, y and z on a volume's one side of its middle.
+MAX_SECTOR_NUMBER = 1_000_000
 _HALF_VOLUME = np.array([VOLUME_SHAPE[2], VOLUME_SHAPE[0], VOLUME_SHAPE[1]]) // 2
 
 
@@ -29,6 +31,15 @@ class SectorIndex(NamedTuple):
 
     def __str__(self) -> str:
         return f"{self.x}_{self.z}"
+
+
+def sector_index(numbers: Sequence[object]) -> SectorIndex:
+    """The sector that a file says it is: two whole numbers within MAX_SECTOR_NUMBER. Raises ValueError."""
+    x, z = numbers
+    # True is an int to Python.
+    if type(x) is not int or type(z) is not int or max(abs(x), abs(z)) > MAX_SECTOR_NUMBER:
+        raise ValueError("expected a sector of two whole numbers")
+    return SectorIndex(x, z)
 
 
 def sector_of(position: Float64) -> SectorIndex:

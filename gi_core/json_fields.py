@@ -1,6 +1,6 @@
 """Typed access to JSON that is not to be trusted: each refusal says where, what was expected, and what was found."""
 
-import math
+import sys
 from collections.abc import Iterable
 from typing import Any
 
@@ -10,6 +10,7 @@ LONGEST_TEXT = 4096
 # Beyond this a double no longer holds every whole number, and readers in other languages would see another one.
 LARGEST_INTEGER = (1 << 53) - 1
 _LONGEST_ECHO = 60
+DEEPEST = 32
 
 
 class Fields:
@@ -97,15 +98,18 @@ class Fields:
         return CorruptFileError(f"{self.where}: {name}: expected {expected}, found {found}; bake it again")
 
 
-def all_finite(value: Any) -> bool:
-    """Whether free-form JSON can be written again as JSON: no NaN, no infinity, no lone surrogate."""
-    if isinstance(value, float):
-        return math.isfinite(value)
+def all_finite(value: Any, depth: int = 0) -> bool:
+    """Whether free-form JSON can be written again as JSON: no NaN, no infinity, no lone surrogate, nothing that overflows, and not nested
+    beyond DEEPEST."""
+    if depth > DEEPEST:
+        return False
+    if isinstance(value, int | float):
+        return abs(value) <= sys.float_info.max
     if isinstance(value, str):
         return _encodable(value)
     if isinstance(value, dict):
-        return all(_encodable(name) and all_finite(part) for name, part in value.items())
-    return all(map(all_finite, value)) if isinstance(value, list) else True
+        return all(_encodable(name) and all_finite(part, depth + 1) for name, part in value.items())
+    return all(all_finite(part, depth + 1) for part in value) if isinstance(value, list) else True
 
 
 def _encodable(text: str) -> bool:

@@ -78,11 +78,6 @@ class LiveShadows:
         self._boxes: tuple[Sequence[MovingBox], Float64] = (), NO_BOXES
         """The boxes of the last tick, and their corners."""
 
-    @property
-    def nbytes(self) -> int:
-        """Bytes on the device."""
-        return self._map.nbytes
-
     def step(
         self,
         positions: Float64,
@@ -119,8 +114,8 @@ class LiveShadows:
                 self._to_sample = covered(self._map.plan, residents)
         elif self._planning is not None:
             if self._planning.done():
-                plan, casters = self._planning.result()
-                self._planning = None
+                planned, self._planning = self._planning, None
+                plan, casters = planned.result()
                 if plan is not None and is_near(plan.to_sun, light.to_sun):
                     self._to_draw = casters
                     self._map.begin(plan)

@@ -82,11 +82,6 @@ class LiveVolume:
         self._rings: tuple[Any, cl.Event] | None = None
         """The filled buffer, once the event says so: from ``enqueue`` to ``publish``."""
 
-    @property
-    def nbytes(self) -> int:
-        """Bytes on the device."""
-        return int(self._buffer.size)
-
     def move(self, first_voxel: Int64, known: frozenset[SectorIndex]) -> None:
         """Stand elsewhere: the lattice index (3,) of voxel (0, 0, 0). ``known``: sectors of the world."""
         self._first, self._boxes = first_voxel, plan_boxes(first_voxel)

@@ -55,11 +55,6 @@ class LiveVolumes:
         """Where players stood at the last ``follow``, x and z [m]."""
 
     @property
-    def nbytes(self) -> int:
-        """Bytes on the device."""
-        return sum(volume.nbytes for volume in list(self.of_player.values()))
-
-    @property
     def missing(self) -> tuple[SectorIndex, ...]:
         """Sectors that published volumes read and that are not there."""
         return tuple(index for index in self.looked_at if index not in self._residents)
@@ -79,12 +74,12 @@ class LiveVolumes:
         for row, name in enumerate(ids):
             place = firsts[row].tobytes()
             if self._firsts.get(name) != place:
-                self._firsts[name] = place
                 volume = self.of_player.get(name)
                 if volume is None:
                     volume = self.of_player[name] = LiveVolume(self._device, self._basis, self._arrays)
                 self._unread(name, volume)
                 volume.move(firsts[row], self._known)
+                self._firsts[name] = place
                 for index in volume.touched:
                     self._readers.setdefault(index, set()).add(name)
                 if volume.published is not None:

@@ -115,6 +115,8 @@ class LiveWorld:
         Raises DeviceError, and InputError for a basis that the dataset cannot be served in.
         """
         self.dataset = dataset
+        # What may be damaged first: a device costs seconds.
+        self._distant = dataset.distant()
         self.plan: StreamPlan | None = None
         self._device = Device(device)
         self._relighter = Relighter(self._device)
@@ -139,22 +141,10 @@ class LiveWorld:
         self._light: LiveLight | None = None
         self._fading: set[SectorIndex] = set()
         """Sectors that are not yet shown as they are."""
-        self._distant = dataset.distant()
         self._placeholders: dict[SectorIndex, Float32] = {}
         """Of this tick's light."""
         self._texel_of = {index: texel for texel, index in enumerate(self._distant.sectors())}
         self._shadows = LiveShadows(self._device, dataset, self._right_of_way) if shadow_map else None
-
-    @property
-    def device_name(self) -> str:
-        """The device's platform, name and version."""
-        return self._device.name
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes on the device: sectors, volumes, the shadow map."""
-        residents = sum(sector.nbytes for sector in list(self.streamer.residents.values()))
-        return residents + self.volumes.nbytes + (self._shadows.nbytes if self._shadows else 0)
 
     def published(self, player: str) -> PublishedVolume | None:
         """A player's latest volume, from any thread; None before its first."""

@@ -14,7 +14,7 @@ from gi_core.container import Container
 from gi_core.errors import CorruptFileError, FormatVersionError
 from gi_core.factor_directions import brick_centres, expected_directions
 from gi_core.factor_weights import Codes
-from gi_core.grid import SectorIndex
+from gi_core.grid import sector_index
 from gi_core.sector import Sector, check_sector, counts, starts
 
 KIND = "SECT"
@@ -180,9 +180,8 @@ def _sector(found: Container) -> Sector:
     else:
         feedback_weight = lit
     emission = take("surfel_emission", "f4", 2).T if "surfel_emission" in found.arrays else None
-    index = found.meta["sector"]
     return Sector(
-        index=SectorIndex(int(index[0]), int(index[1])),
+        index=sector_index(found.meta["sector"]),
         probe_position=np.ascontiguousarray(quantise.decode_length(probe_position.T), np.float32),
         probe_flags=take("probe_flags", "u1", 1),
         probe_room=_unsigned(found, "probe_room", 1).astype(np.uint16),

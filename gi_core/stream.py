@@ -84,7 +84,6 @@ class Streamer:
         way to ``ticks``."""
         self.residents: dict[SectorIndex, LiveSector] = {}
         self.failures: dict[SectorIndex, Failure] = {}
-        self.loads = 0
         self.lamps_planned = False
         """Whether sectors that arrive are counted with room for lamps."""
         self.table, self._load, self._place, self._options = table, load, place, options
@@ -135,7 +134,6 @@ class Streamer:
                 self._state.resident_bytes[row] = found.budget_bytes(self.lamps_planned)
                 self._state.retry_at_s[row] = 0.0
                 self.failures.pop(index, None)
-                self.loads += 1
                 arrived.append(index)
             else:
                 attempts = self.failures[index].attempts + 1 if index in self.failures else 1

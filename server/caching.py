@@ -9,7 +9,7 @@ from server.dependencies import service_of
 from server.finished_replies import Body, FinishedReply, names, target_of
 from server.server_timing import Laps
 
-__all__ = ["FILE_CACHE_CONTROL", "QUERY_CACHE_CONTROL", "Body", "conditional", "has_current", "strong_etag"]
+__all__ = ["FILE_CACHE_CONTROL", "QUERY_CACHE_CONTROL", "Body", "conditional", "strong_etag"]
 
 # A query's answer changes only when the server gets another dataset; a minute is how long a client may not notice.
 QUERY_CACHE_CONTROL = "public, max-age=60"
@@ -26,17 +26,12 @@ def strong_etag(*parts: object) -> str:
     return f'"{digest.hexdigest()}"'
 
 
-def has_current(request: Request, etag: str) -> bool:
-    """Whether If-None-Match names ``etag``, compared weakly (RFC 9110, 13.1.2)."""
-    return names(request.headers, etag)
-
-
 def conditional(request: Request, etag: str, compute: Callable[[], Body], laps: Laps | None = None) -> Response:
     """304 when the client has the reply already, else the reply: a finished one, or what ``compute`` returns.
 
     ``*`` in If-None-Match means any successful reply. A reply that is computed says what took how long: ``laps``, or all of it as one.
     """
-    if has_current(request, etag):
+    if names(request.headers, etag):
         return Response(status_code=304, headers={"ETag": etag, "Cache-Control": QUERY_CACHE_CONTROL})
     replies = service_of(request).replies
     reply, laps = replies.get(etag), laps or Laps()

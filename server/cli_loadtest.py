@@ -17,7 +17,7 @@ class LoadTestMode(StrEnum):
 
 def loadtest(
     url: Annotated[str, typer.Argument(help="Of a running server, as in http://127.0.0.1:8000")],
-    players: Annotated[int, typer.Option(min=1, max=10_000, help="Simulated players to make; a client follows each.")] = 1,
+    players: Annotated[int, typer.Option(min=1, max=1000, help="Simulated players to make; a client follows each.")] = 1,
     seconds: Annotated[float, typer.Option(min=1, max=1e6, help="How long, once all players are there.")] = 30.0,
     warm_up: Annotated[
         float,
@@ -27,7 +27,7 @@ def loadtest(
         Path | None,
         typer.Option(help="JSON: a list of points x, y, z in metres, or several such lists; without it players walk the streets."),
     ] = None,
-    speed: Annotated[float, typer.Option(min=0, max=1000, help="Of the players, in m/s.")] = 5.0,
+    speed: Annotated[float, typer.Option(min=0, max=200, help="Of the players, in m/s.")] = 5.0,
     mode: Annotated[
         LoadTestMode, typer.Option(help="stream: a WebSocket for each player; fetch: ask for its volume at the rate of ticks.")
     ] = LoadTestMode.stream,

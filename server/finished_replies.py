@@ -45,7 +45,7 @@ class FinishedReply:
     def answer(self, headers: Mapping[str, str]) -> Response:
         """The reply, or 304 when a request's headers say that the client has it."""
         shared = {"ETag": self.etag, "Cache-Control": self.cache_control}
-        if names(headers, self.etag) or headers.get("if-none-match", "").strip() == "*":
+        if names(headers, self.etag, is_there=True):
             return Response(status_code=304, headers=shared)
         return self.whole
 
@@ -56,10 +56,10 @@ class FinishedReply:
         return Response(self.body.content, media_type=self.body.media_type, headers=headers)
 
 
-def names(headers: Mapping[str, str], etag: str) -> bool:
-    """Whether If-None-Match names ``etag``, compared weakly (RFC 9110, 13.1.2)."""
+def names(headers: Mapping[str, str], etag: str, is_there: bool = False) -> bool:
+    """Whether If-None-Match names ``etag``, compared weakly (RFC 9110, 13.1.2); ``*`` does of what is known to be there."""
     given = headers.get("if-none-match", "")
-    return etag in {candidate.strip().removeprefix("W/") for candidate in given.split(",")}
+    return (is_there and given.strip() == "*") or etag in {candidate.strip().removeprefix("W/") for candidate in given.split(",")}
 
 
 class FinishedReplies:

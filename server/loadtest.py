@@ -21,6 +21,8 @@ from server.loadtest_record import Live, Recorder, Setting, report_of
 
 POLL_S = 1.0
 REQUEST_S = 30.0
+# Kernels that are new to a machine take half a minute, or two on a slow one.
+STARTUP_S, ASK_AGAIN_S = 180.0, 0.5
 DEFAULT_TICK_RATE = 30.0
 # A world's clock that is this far from where its rate should have brought it was set, not late.
 JUMP_S = 2.0
@@ -77,7 +79,7 @@ async def _run(options: Options, progress: Progress) -> dict[str, Any]:
     async with (
         httpx.AsyncClient(base_url=options.url, headers=headers, timeout=REQUEST_S, limits=limits, trust_env=False) as http,
         _interruptible(stop),
-        _players(http, options) as players,
+        _players(http, options, stop) as players,
     ):
         recorder = Recorder()
         if options.warm_up_s > 0:
@@ -126,15 +128,20 @@ async def _interruptible(stop: asyncio.Event) -> AsyncIterator[None]:
 
 
 @contextlib.asynccontextmanager
-async def _players(http: httpx.AsyncClient, options: Options) -> AsyncIterator[list[str]]:
-    """The names of new players of the server, which are deleted in the end. Raises InputError or LoadTestError."""
-    run_name, made, turns = f"loadtest-{token_hex(4)}", [], asyncio.Semaphore(PARALLEL_REQUESTS)
+async def _players(http: httpx.AsyncClient, options: Options, stop: asyncio.Event) -> AsyncIterator[list[str]]:
+    """The names of new players of the server, which are deleted in the end; no more of them once ``stop`` is set. Raises InputError or
+    LoadTestError."""
+    run_name, made, asked, turns = f"loadtest-{token_hex(4)}", [], set(), asyncio.Semaphore(PARALLEL_REQUESTS)
 
     async def make(number: int) -> None:
         wish: dict[str, Any] = {"id": f"{run_name}-{number}", "speed": options.speed, "loop": True, "seed": options.seed + number}
         if options.paths:
             wish["path"] = [list(point) for point in options.paths[number % len(options.paths)]]
         async with turns:
+            if stop.is_set():
+                return
+            # One whose reply is lost is there all the same.
+            asked.add(wish["id"])
             reply = await _send(http, "POST", "/v1/players", options.url, json=wish)
         made.append(_player_name(reply))
 
@@ -149,7 +156,7 @@ async def _players(http: httpx.AsyncClient, options: Options) -> AsyncIterator[l
                 raise ended
         yield sorted(made, key=lambda name: (len(name), name))
     finally:
-        await asyncio.gather(*(delete(name) for name in made))
+        await asyncio.gather(*(delete(name) for name in asked.union(made)))
 
 
 def _player_name(reply: httpx.Response) -> str:
@@ -171,11 +178,17 @@ def _object(reply: httpx.Response) -> dict[str, Any]:
 
 
 async def _send(http: httpx.AsyncClient, method: str, target: str, url: str, **content: Any) -> httpx.Response:
-    """A reply of success. InputError for a 4xx and for no server at all, LoadTestError for a 5xx."""
-    try:
-        reply = await http.request(method, target, **content)
-    except httpx.HTTPError as error:
-        raise InputError(f"{url}: expected a Sectorlight server, found {error or type(error).__name__}") from error
+    """A reply of success. InputError for a 4xx and for no server at all, LoadTestError for a 5xx; a server that is not ready yet is asked
+    again for STARTUP_S."""
+    give_up_at = time.perf_counter() + STARTUP_S
+    while True:
+        try:
+            reply = await http.request(method, target, **content)
+        except httpx.HTTPError as error:
+            raise InputError(f"{url}: expected a Sectorlight server, found {error or type(error).__name__}") from error
+        if reply.status_code != 503 or "retry-after" not in reply.headers or time.perf_counter() > give_up_at:
+            break
+        await asyncio.sleep(ASK_AGAIN_S)
     if reply.status_code in (401, 403):
         raise InputError(f"{url}: {method} {target}: it wants its bearer token for that: give --token-file FILE")
     if reply.is_server_error:

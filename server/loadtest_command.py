@@ -1,5 +1,6 @@
 """``sectorlight loadtest``: the files it reads and writes, its progress, its table."""
 
+import io
 import json
 import math
 from pathlib import Path
@@ -82,7 +83,9 @@ def run_command(options: Options, limits: Limits, json_path: Path | None, plot_p
     if json_path is not None:
         write_atomic(json_path, (json.dumps(report, indent=1, allow_nan=False) + "\n").encode())
     if plot_path is not None:
-        loadtest_plot.draw(report).save(plot_path, "PNG")
+        picture = io.BytesIO()
+        loadtest_plot.draw(report).save(picture, "PNG")
+        write_atomic(plot_path, picture.getvalue())
     Console().print(table_of(report))
     return list(loadtest_limits.missed(report, limits)), report["interrupted"]
 

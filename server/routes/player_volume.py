@@ -63,7 +63,7 @@ async def player_volume(
         headers["Gi-Boxes"] = str(len(boxes))
     # A tick that has not been yet is from before a restart.
     is_old = query.since is not None and found.tick <= query.since <= ticker.tick
-    if is_old or names(request.headers, etag):
+    if is_old or names(request.headers, etag, is_there=True):
         return Response(status_code=304, headers=headers)
 
     def encode() -> Body:

@@ -8,9 +8,10 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from gi_core.constants import SECTOR_SIZE_M
 from gi_core.errors import CorruptFileError, SectorMissingError
 from gi_core.grid import SectorIndex
-from server.caching import FILE_CACHE_CONTROL, Body, conditional, has_current, strong_etag
+from server.caching import FILE_CACHE_CONTROL, Body, conditional, strong_etag
 from server.dependencies import NoQuery, ServiceDep
 from server.encoding import REPLY_VERSION
+from server.finished_replies import names
 from server.models import SectorReply, SectorsReply
 from server.openapi import NOT_CHANGED, reply
 from server.ranges import file_reply
@@ -50,7 +51,7 @@ def sector_file(request: Request, service: ServiceDep, x: SectorNumber, z: Secto
     if facts is None:
         raise SectorMissingError(f"sector {x},{z}: expected one that /v1/sectors lists, found none")
     etag = f'"{facts.digest}"'
-    if has_current(request, etag):
+    if names(request.headers, etag, is_there=True):
         return Response(status_code=304, headers={"ETag": etag, "Cache-Control": FILE_CACHE_CONTROL})
     return file_reply(request, read_checked(service, index, facts.bytes, facts.digest), etag, FILE_CACHE_CONTROL)
 

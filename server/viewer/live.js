@@ -91,7 +91,10 @@ function steer(player, clock, weather) {
   if (moved) for (const id of ["eye", "look"]) at(id).dispatchEvent(new Event("change"));
 }
 
+let nextPoll = 0;
+
 async function poll() {
+  clearTimeout(nextPoll);  // of a panel that was closed and opened again meanwhile
   if (!at("live").open) return;
   const clock = await tell("GET", "clock");
   const players = clock && await tell("GET", "players");
@@ -104,7 +107,8 @@ async function poll() {
     const player = players.players.find((p) => p.id === followed);
     if (player && !at("picture").classList.contains("waiting")) steer(player, clock, weather.now.text);
   }
-  setTimeout(poll, POLL_MS);
+  clearTimeout(nextPoll);
+  nextPoll = setTimeout(poll, POLL_MS);
 }
 
 async function opened() {

@@ -231,7 +231,7 @@ CASES = {
     "street": Case(street, (-20, 0.5, -7), (20, 20, 7)),
     "munich": Case(munich_crop, (-122, 2, 28), (-58, 25, 92), MUNICH),
     "midtown": Case(midtown_crop, (105, 2, 155), (165, 25, 215), MIDTOWN),
-    "interior": Case(interior, (-5, 0.5, -4), (5, 3.5, 4), most_blocked=1.0, effort=3),
+    "interior": Case(interior, (-5, 0.5, -4), (5, 3.5, 4), most_blocked=1.0, effort=6),
 }
 
 

@@ -158,6 +158,12 @@ def broken():
         "no objects": (with_change(lambda d: d.update(CityObjects={})), "found none"),
         "a bad transform": (with_change(lambda d: d.update(transform={"scale": "x"})), "transform"),
         "no vertices": (with_change(lambda d: d.update(vertices=[])), "vertices"),
+        "a vertex of 400 digits": (with_change(lambda d: d["vertices"][0].__setitem__(0, 10**400)), "vertices"),
+        "an index of 400 digits": (
+            with_change(lambda d: d["CityObjects"]["house"]["geometry"][0]["boundaries"][0][0].__setitem__(0, [0, 1, 10**400])),
+            "house",
+        ),
+        "a lod of 400 digits": (with_change(lambda d: d["CityObjects"]["house"]["geometry"][0].update(lod=10**400)), "house"),
         "ragged vertices": (with_change(lambda d: d.update(vertices=[[1, 2], [3]])), "vertices"),
         "geometry of text": (with_change(lambda d: d["CityObjects"]["house"]["geometry"][0].update(boundaries=5)), "house"),
         "only bad indices": (with_change(lambda d: d.update(vertices=d["vertices"][:1])), "found none"),

@@ -232,6 +232,7 @@ def test_a_file_that_says_it_is_in_longitude_and_latitude_is_read_as_one_that_do
         (named_crs("EPSG:999999"), "PROJ knows, as EPSG:4326, found 'EPSG:999999'"),
         (named_crs("the city's own"), 'PROJ knows, as EPSG:4326, found "the city\'s own"'),
         (named_crs("EPSG:4978"), "Geocentric"),
+        (named_crs("\ud800"), "PROJ knows"),
         (named_crs("EPSG:5709"), "Vertical"),
         (named_crs(4326), "expected .*name.*take it out"),
         ({"type": "link", "properties": {"href": "http://example.com/crs/42", "type": "proj4"}}, "expected .*name.*found .*link"),
@@ -260,6 +261,9 @@ REFUSED = {
     "projected metres": (json.dumps({"type": "FeatureCollection", "features": [
         {"type": "Feature", "properties": {}, "geometry": {"type": "Polygon", "coordinates": [[[5e5, 4e6], [5e5, 4.1e6], [6e5, 4e6]]]}}
     ]}), "longitude and latitude"),
+    "a place of 400 digits": (json.dumps({"type": "FeatureCollection", "features": [
+        {"type": "Feature", "properties": {}, "geometry": {"type": "Polygon", "coordinates": [[[10**400, 1], [0, 1], [1, 0]]]}}
+    ]}), "feature 0: expected rings"),
     "words for numbers": (json.dumps({"type": "FeatureCollection", "features": [
         {"type": "Feature", "properties": {}, "geometry": {"type": "Polygon", "coordinates": [[["a", "b"], ["c", "d"], ["e", "f"]]]}}
     ]}), "feature 0: expected rings"),
@@ -281,6 +285,12 @@ def test_a_height_in_a_wrong_type_or_unit_names_its_feature(tmp_path):
         load_scene(write(tmp_path / "a.geojson", square(0, 0, 10, height=5), square(50, 0, 10, height=[5])))
     with pytest.raises(SourceError, match="feature 0: expected a height of at most"):
         load_scene(write(tmp_path / "a.geojson", square(0, 0, 10, height=12_000)))
+
+
+def test_a_height_of_400_digits_counts_as_none_and_any_name_has_a_colour(tmp_path):
+    plain = load_scene(write(tmp_path / "a.geojson", square(0, 0, 10, building="\ud800")))
+    huge = load_scene(write(tmp_path / "b.geojson", square(0, 0, 10, building="\ud800", height=10**400)))
+    assert np.array_equal(plain.vertices, huge.vertices)
 
 
 def test_a_polygon_of_more_holes_than_can_be_triangulated_in_time_is_refused_by_name(tmp_path):

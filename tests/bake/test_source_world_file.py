@@ -132,6 +132,7 @@ WRONG = {
         replaced('"forbid"', '"add"\nspacing_m = 0.25').replace("maximum = [1, 1, 1]", "maximum = [800, 90, 800]"),
         r"asks for 23,592,960 probes in one sector, which holds \d+; make spacing_m larger, or the box smaller",
     ),
+    "north of 400 digits": (replaced("29.0", "1" * 400), "north_degrees"),
     "north in words": (replaced("29.0", '"up"'), "north_degrees"),
     "no source": ("name = 'x'\n", "at least one"),
     "a source that is a table": ("[source]\npath = 'box.ply'\n", r"expected tables \[\[source\]\]"),

@@ -151,6 +151,10 @@ def voxels(slices):
         (lambda meta: meta.update(voxel_first=[float("inf"), 0, 0]), None, "inconsistent"),
         (lambda meta: meta.update(sector=[float("inf"), 0]), None, "inconsistent"),
         (lambda meta: meta.update(sector="here"), None, "inconsistent"),
+        (lambda meta: meta.update(sector=[10**400, 0]), None, "inconsistent"),
+        (lambda meta: meta.update(sector=[True, 0]), None, "inconsistent"),
+        (None, lambda a: a.update(voxel_room=np.full_like(a["voxel_room"], 9)), "expected rooms of 1 to"),
+        (None, lambda a: a.update(probe_room=np.full_like(a["probe_room"], 9)), "expected rooms of 1 to"),
         (lambda meta: meta.update(sky_patches=[]), None, "inconsistent"),
         (lambda meta: meta.update(bake=7), None, "inconsistent"),
         (lambda meta: meta.update(unheard_of=1), None, "unheard_of"),
@@ -175,6 +179,13 @@ def test_a_forged_sector_is_refused_by_name(root, change_meta, change_arrays, sa
     rewrite(path, "SECT", change_meta, change_arrays)
     with pytest.raises(CorruptFileError, match=rf"0_0\.gisec: .*({says})"):
         Dataset.open(root).sector(HERE)
+
+
+@pytest.mark.parametrize("sector", [[10**400, 0], [1_000_001, 0], [0], "here"])
+def test_geometry_of_no_sector_is_refused_by_name(root, sector):
+    rewrite(geometry_path(root, HERE), "GEOM", lambda meta: meta.update(sector=sector), None)
+    with pytest.raises(CorruptFileError, match=r"0_0\.gigeo: inconsistent contents"):
+        Dataset.open(root).geometry(HERE)
 
 
 @pytest.mark.parametrize("kind", ["SECT", "GEOM", "DIST"])

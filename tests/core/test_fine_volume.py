@@ -104,9 +104,15 @@ def rewritten(path: Path, change_meta=None, change_arrays=None) -> None:
     [
         (lambda m: m.update(bake_id="f" * 32), None, "of another bake"),
         (lambda m: m.update(sector=[-1, 0]), None, "expected voxels of sector"),
+        (lambda m: m.update(sector=[10**400, 0]), None, "inconsistent contents"),
         (lambda m: m.update(voxel_first=[0, 0]), None, "expected voxels of sector"),
         (lambda m: m.pop("voxel_first"), None, "inconsistent contents"),
         (None, lambda a: a.update(voxel_probe=np.full_like(a["voxel_probe"], 900)), "expected voxels of 20 probes"),
+        (
+            None,
+            lambda a: a.update(voxel_probe=np.full_like(a["voxel_probe"], 900), voxel_weight=np.zeros_like(a["voxel_weight"])),
+            "expected voxels of 20 probes",
+        ),
         (None, lambda a: a.update(voxel_probe=np.full_like(a["voxel_probe"], 1000)), "expected voxels of sector"),
         (None, lambda a: a.update(voxel_class=np.full_like(a["voxel_class"], 3)), "expected voxels of sector"),
         (None, lambda a: a.update(voxel_class=a["voxel_class"][:, 1:]), "expected voxels of sector"),

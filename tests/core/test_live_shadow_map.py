@@ -2,6 +2,7 @@
 
 import threading
 import time
+from concurrent.futures import Future
 from dataclasses import replace
 from itertools import pairwise
 
@@ -92,6 +93,18 @@ def test_a_sector_has_samples_before_somebody_who_comes_sees_it(engine, speed, f
         assert len(world.volumes.looked_at) == 2
     finally:
         world.close()
+
+
+def test_a_plan_that_failed_costs_one_tick(shaded, engine):
+    world, _ = shaded
+    run, light = Run(world), light_of(world, engine.lighting("15:00", "clear"), standing=False)
+    run.tick(at(STREET), light)
+    failed: Future = Future()
+    failed.set_exception(MemoryError())
+    world._shadows._planning = failed
+    with pytest.raises(MemoryError):
+        run.tick(at(STREET), light)
+    assert run.tick(at(STREET), light)
 
 
 def test_nothing_pops_when_other_samples_say_otherwise(shaded, engine):

@@ -5,8 +5,10 @@ from datetime import datetime, timedelta
 from itertools import count
 
 import numpy as np
+import pytest
 from live_run import EAST, GOLDEN, STREET, Run, at, light_of
 
+from gi_core import live_volumes
 from gi_core.constants import VOXEL_SIZE_M
 from gi_core.dataset import Dataset
 from gi_core.grid import SectorIndex
@@ -95,6 +97,20 @@ def test_what_is_seen_is_shown_by_the_tick_that_finds_it(world, engine):
     report = world.tick(1000, players, light_of(world, engine.lighting("12:30", "clear"), standing=False))
     assert report.relit
     assert len(report.filled) == len(players.ids)
+
+
+def test_a_player_for_whom_there_was_no_room_gets_a_volume_later(world, engine, monkeypatch):
+    light, room = light_of(world, engine.lighting("12:00", "clear")), live_volumes.LiveVolume
+
+    def full(*_):
+        raise MemoryError
+
+    monkeypatch.setattr(live_volumes, "LiveVolume", full)
+    with pytest.raises(MemoryError):
+        world.tick(1, at(STREET), light)
+    monkeypatch.setattr(live_volumes, "LiveVolume", room)
+    run = Run(world)
+    assert run.until(at(STREET), light, lambda report: world.published("p0") is not None)
 
 
 def test_without_any_time_left_two_sectors_are_relit_all_the_same(world, engine):

@@ -117,6 +117,7 @@ def first_sector(http: httpx.Client) -> tuple[str, bytes, str]:
 
 def test_sector_files_are_immutable(http: httpx.Client) -> None:
     href, _, etag = first_sector(http)
+    assert http.get(href, headers={"If-None-Match": "*"}).status_code == 304
     assert "immutable" in http.get(href).headers["cache-control"]
     unchanged = http.get(href, headers={"If-None-Match": etag})
     assert (unchanged.status_code, unchanged.content) == (304, b"")

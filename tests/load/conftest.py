@@ -47,6 +47,8 @@ class Behaviour:
     misses: bool = False
     fails_volumes: bool = False
     has_no_live: bool = False
+    starts_after: int = 0  # requests for players that it is not ready for
+    loses_replies: bool = False  # it makes players and says that it failed
     token: str | None = None
 
     def strikes(self, tick: int) -> bool:
@@ -63,6 +65,7 @@ class StandIn:
     players: dict[str, dict[str, Any]] = field(default_factory=dict)
     made: list[dict[str, Any]] = field(default_factory=list)
     asked_full: int = 0
+    refused: int = 0
 
     @property
     def tick(self) -> int:
@@ -88,8 +91,13 @@ class StandIn:
         if not self.authorised(request):
             return JSONResponse({"status": 401}, 401)
         wish = await request.json()
+        if self.behaviour.starts_after > self.refused:
+            self.refused += 1
+            return JSONResponse({"status": 503}, 503, {"Retry-After": "1"})
         self.made.append(wish)
         self.players[wish["id"]] = wish
+        if self.behaviour.loses_replies:
+            return JSONResponse({"status": 500}, 500)
         return JSONResponse({"id": wish["id"], "position": [0, 0, 0], "velocity": [0, 0, 0]}, 201)
 
     async def delete_player(self, request: Request) -> Response:

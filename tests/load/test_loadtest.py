@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from server.loadtest import Options, run
+from server.loadtest import LoadTestError, Options, run
 
 StandingIn = Callable[..., AbstractContextManager[tuple[Any, str]]]
 CONTRACT = {"players", "seconds", "tick_ms", "late_ticks", "volume_ms", "bytes_per_second_per_player", "misses", "pops", "errors"}
@@ -95,6 +95,22 @@ def test_a_lost_frame_is_an_error_and_a_full_one_is_asked_for(standing_in: Stand
     assert 2 <= report["errors"] <= 12
     assert report["full_frames"] >= 4
     assert all("FrameLostError" in text for text in report["error_messages"])
+
+
+def test_a_server_that_still_warms_up_is_asked_again(standing_in: StandingIn) -> None:
+    with standing_in(starts_after=3) as (world, url):
+        report = measure(url, seconds=1.0)
+        assert world.refused == 3
+    assert report["errors"] == 0
+    assert report["frames"] > 2
+
+
+def test_players_whose_replies_were_lost_are_deleted_too(standing_in: StandingIn) -> None:
+    with standing_in(loses_replies=True) as (world, url):
+        with pytest.raises(LoadTestError, match="POST /v1/players: status 500"):
+            measure(url, seconds=1.0)
+        assert world.made
+        assert not world.players
 
 
 @pytest.mark.parametrize(("fault", "text"), [("sends_garbage", "StreamError"), ("closes", "closed"), ("fails_volumes", "status 500")])
