@@ -54,7 +54,7 @@ def read_rooms(top: Fields, version: int) -> tuple[Room, ...]:
 
 def _room(record: Any, where: str, version: int) -> Room:
     room = Fields(record, where, Room.__dataclass_fields__ if version >= ROOMS_VERSION else ("name", "minimum", "maximum"))
-    box = room.text("name"), room.point("minimum"), room.point("maximum")
+    box = room.text("name"), *_corners(room)
     if version < ROOMS_VERSION:
         return Room(*box)
     openings = tuple(_opening(record, f"{room.where}: openings", version) for record in room.sequence("openings", MAX_OPENINGS))
@@ -65,7 +65,16 @@ def _room(record: Any, where: str, version: int) -> Room:
 
 def _opening(record: Any, where: str, version: int) -> Opening:
     opening = Fields(record, where, ("minimum", "maximum", "to") if version >= DOORS_VERSION else ("minimum", "maximum"))
-    return Opening(opening.point("minimum"), opening.point("maximum"), opening.integer("to", 0) if version >= DOORS_VERSION else 0)
+    return Opening(*_corners(opening), opening.integer("to", 0) if version >= DOORS_VERSION else 0)
+
+
+def _corners(box: Fields) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    low, high = box.point("minimum"), box.point("maximum")
+    if any(least > most for least, most in zip(low, high, strict=True)):
+        raise CorruptFileError(
+            f"{box.where}: expected minimum below maximum on every axis, found {list(low)} and {list(high)}; bake it again"
+        )
+    return low, high
 
 
 def _room_cells(cells: Fields, version: int) -> RoomCells:

@@ -1,1 +1,1 @@
-"""HTTP service, command line and load test. Knows gi_core; never bake_jobs (the command line imports that lazily)."""
+"""HTTP service, command line and load test. Knows gi_core; bake_jobs where a command or a picture of errors asks for it, and only then."""

@@ -1,6 +1,7 @@
 """How routes get at the live world: the first of them starts it. Reads are told to come back while it warms up, writes wait.
 
-A world that was built before is warm in a second or two; kernels that are new to a machine take half a minute.
+A world that was built before is warm in a second or two; kernels that are new to a machine take half a minute, of which writes
+wait WRITES_WAIT_S before they too are told to come back.
 """
 
 import asyncio

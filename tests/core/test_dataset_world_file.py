@@ -283,6 +283,7 @@ def test_a_member_that_is_missing_or_of_another_type_is_refused_by_name(path):
         (("sun_table", "declination_step_degrees"), 0),
         (("rooms", 0, "minimum"), [0, 0]),
         (("rooms", 0, "maximum"), [0, 0, float("inf")]),
+        (("rooms", 0, "maximum"), [-1e6, 1e6, 1e6]),
         (("rooms",), [[]]),
         (("lamps", 0, "lumens"), -1),
         (("lamps", 0, "color"), [1, 1, float("nan")]),
