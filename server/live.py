@@ -12,10 +12,11 @@ from types import MappingProxyType
 
 from gi_core.dataset import Dataset
 from gi_core.epw_weather import EpwWeather
+from gi_core.grid import SectorIndex
 from gi_core.live_world import DEFAULT_BUDGET_BYTES, LiveWorld
 from gi_core.user_sky import UserSky
 from server.kept_edits import KeptEdits, load_kept
-from server.live_state import LivePlayer, LiveState, LiveUnavailableError, NotKeptError, authored_lamps
+from server.live_state import LivePlayer, LiveState, LiveUnavailableError, NotKeptError, Residency, authored_lamps
 from server.live_weather import fixed_weather
 from server.players import Player, read_players
 from server.street_lattice import StreetLattice
@@ -75,6 +76,15 @@ class Live:
     def started_ticker(self) -> Ticker | None:
         """The ticker, if there is one; starts none."""
         return self._ticker
+
+    def residency(self) -> dict[SectorIndex, Residency]:
+        """Of sectors that the live world holds or failed to load; none where there is no live world."""
+        if self._ticker is None:
+            return {}
+        world = self._ticker.world
+        read = set(list(world.volumes.looked_at))  # copied whole, while ticks go on
+        found: dict[SectorIndex, Residency] = dict.fromkeys(list(world.streamer.failures), "failed")
+        return found | {index: "read by a player" if index in read else "resident" for index in list(world.streamer.residents)}
 
     @property
     def ticker(self) -> Ticker:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 from gi_core.errors import InputError, SectorlightError
 from gi_core.settings import NEUTRAL, Settings
@@ -23,6 +23,8 @@ from server.world_clock import WorldClock
 MAX_LAMPS = 20_000
 # Their triangles, twelve each, are drawn in one tick, at half a millisecond a thousand.
 MAX_BOXES = 256
+# What the live world has of a sector.
+Residency = Literal["read by a player", "resident", "failed", "not resident"]
 _NOT_OF_IDS = re.compile(r"[^A-Za-z0-9_-]+")
 
 

@@ -1,32 +1,44 @@
 """What lies behind a picture: false colours of surfaces, and probes as little spheres (``view=``). One table names them."""
 
 import colorsys
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from typing import Literal
 
 import numpy as np
 
 from gi_core import ambient_cube
-from gi_core.arrays import Bool, Float32, Float64, Int64, UInt8
+from gi_core.arrays import Float32, Float64, Int64, UInt8
 from gi_core.constants import ROOM_OUTDOORS, SECTOR_SIZE_M, VOXEL_INDOORS, VOXEL_NO_SECTOR, VOXEL_OUTDOORS, VOXEL_SIZE_M, VOXEL_SOLID
 from gi_core.engine import Engine, LitProbes
 from gi_core.errors import OutsideWorldError
+from gi_core.grid import SectorIndex
 from gi_core.lighting import Lighting
 from gi_core.snow import snow_attribute
-from server import tonemap
+from server import preview_surfels, tonemap
 from server.camera import Camera
 from server.labels import with_key
+from server.live_state import Residency
 from server.preview import STRAIGHT_UP, city_radiance
 from server.preview_light import SAMPLE_OFFSET_M, Look, ServedLight, plan_volumes
 from server.preview_scene import PreviewScene
-from server.raycast import Surface
+from server.preview_seen import NO_SURFACE, Seen
 
-ViewName = Literal["probes", "rooms", "albedo", "normal", "snow", "voxels", "sectors", "sun"]
+ViewName = Literal[
+    "probes",
+    "rooms",
+    "albedo",
+    "normal",
+    "snow",
+    "sun",
+    "surfel_albedo",
+    "surfel_normal",
+    "surfel_snow",
+    "surfel_sun",
+    "voxels",
+    "sectors",
+    "residency",
+]
 
-NO_SURFACE = (60, 60, 60)
-# A surface that is seen edge-on is drawn this much darker, so that shapes show.
-EDGE_SHADE = 0.5
 PROBE_RADIUS_M, PROBE_REACH_M = 0.25, 60.0
 # Of the spheres that show probes' light.
 PROBE_ALBEDO = 0.8
@@ -40,52 +52,28 @@ VOXEL_COLOURS = {
 SECTOR_COLOURS = np.array([[[110, 150, 200], [225, 205, 130]], [[200, 130, 110], [140, 185, 130]]], np.uint8)  # z even or odd, x
 # Lines between sectors.
 SEAM_M, SEAM_COLOUR = 0.5, (30, 30, 30)
+RESIDENCY_COLOURS: dict[Residency, tuple[int, int, int]] = {
+    "read by a player": (225, 205, 130),
+    "resident": (120, 180, 120),
+    "failed": (200, 60, 50),
+    "not resident": (110, 110, 120),
+}
 SUN_COLOURS = {"lit": (255, 225, 130), "shadow": (70, 90, 150), "turned away": (45, 45, 60)}
 
 
-@dataclass(frozen=True, eq=False)
-class Seen:
-    """What a view draws from: the camera, what its rays meet (``hit``: where they meet any), and the light."""
-
-    engine: Engine
-    scene: PreviewScene
-    camera: Camera
-    lighting: Lighting
-    surface: Surface
-
-    @property
-    def position(self) -> Float64:
-        """(k, 3) [m], of pixels that show a surface."""
-        return self.surface.position[self.surface.hit]
-
-    @property
-    def normal(self) -> Float32:
-        """(k, 3), of pixels that show a surface."""
-        return self.surface.normal[self.surface.hit]
-
-    def picture(self, colours: UInt8) -> UInt8:
-        """(height, width, 3) sRGB of colours (k, 3) of pixels that show a surface."""
-        pixels = np.full((len(self.surface.hit), 3), NO_SURFACE, np.uint8)
-        pixels[self.surface.hit] = colours
-        return pixels.reshape(self.camera.height, self.camera.width, 3)
-
-    def shaded(self, colours: UInt8) -> UInt8:
-        """Colours (k, 3), darker where a surface is seen edge-on."""
-        facing = -(self.normal * self.camera.rays()[self.surface.hit]).sum(axis=1)
-        return np.asarray(colours * (1 - EDGE_SHADE + EDGE_SHADE * np.clip(facing, 0, 1))[:, None] + 0.5).astype(np.uint8)
-
-    def reached(self, direction: Float64, some: Int64 | None = None) -> Bool:
-        """Which pixels that show a surface, or the ``some`` of them by number, see far towards a direction (3,)."""
-        position, normal = (self.position, self.normal) if some is None else (self.position[some], self.normal[some])
-        return np.zeros(0, bool) if self.scene.rays is None else self.scene.rays.lit(position, normal, direction)
-
-
-def draw(view: ViewName, engine: Engine, scene: PreviewScene, camera: Camera, lighting: Lighting) -> UInt8:
-    """(height, width, 3) uint8 sRGB. Raises CorruptFileError."""
+def draw(
+    view: ViewName,
+    engine: Engine,
+    scene: PreviewScene,
+    camera: Camera,
+    lighting: Lighting,
+    residency: Mapping[SectorIndex, Residency] | None = None,
+) -> UInt8:
+    """(height, width, 3) uint8 sRGB. ``residency``: of sectors in the live world. Raises CorruptFileError."""
     if scene.rays is None:
         return np.full((camera.height, camera.width, 3), NO_SURFACE, np.uint8)
     surface = scene.rays.first_surface(camera.eye, camera.rays())
-    return VIEWS[view](Seen(engine, scene, camera, lighting, surface))
+    return VIEWS[view](Seen(engine, scene, camera, lighting, surface, residency or {}))
 
 
 def albedo(seen: Seen) -> UInt8:
@@ -117,11 +105,26 @@ def sun(seen: Seen) -> UInt8:
 
 def sectors(seen: Seen) -> UInt8:
     """A checkerboard of sectors, with lines between them."""
+    x, z = np.floor(seen.position[:, [0, 2]] / SECTOR_SIZE_M).astype(np.int64).T
+    return seen.picture(seen.shaded(_with_lines(seen, SECTOR_COLOURS[z % 2, x % 2])))
+
+
+def residency(seen: Seen) -> UInt8:
+    """Which sectors the live world holds: those that players' volumes read, others, those that cannot be loaded, and none."""
+    place = np.floor(seen.position[:, [0, 2]] / SECTOR_SIZE_M).astype(np.int64)
+    each, which = np.unique(place, axis=0, return_inverse=True)
+    of_each = [RESIDENCY_COLOURS[seen.residency.get(SectorIndex(x, z), "not resident")] for x, z in each.tolist()]
+    colours = np.array(of_each, np.uint8).reshape(-1, 3)[which.reshape(-1)]
+    return with_key(
+        seen.picture(seen.shaded(_with_lines(seen, colours))), {str(word): colour for word, colour in RESIDENCY_COLOURS.items()}
+    )
+
+
+def _with_lines(seen: Seen, colours: UInt8) -> UInt8:
+    """Colours (k, 3) of pixels that show a surface, with lines between sectors."""
     place = seen.position[:, [0, 2]] / SECTOR_SIZE_M
-    x, z = np.floor(place).astype(np.int64).T
-    colours = SECTOR_COLOURS[z % 2, x % 2]
     colours[(np.abs(place - np.round(place)) * SECTOR_SIZE_M < SEAM_M / 2).any(axis=1)] = SEAM_COLOUR
-    return seen.picture(seen.shaded(colours))
+    return colours
 
 
 def voxels(seen: Seen) -> UInt8:
@@ -213,7 +216,12 @@ VIEWS: dict[ViewName, Callable[[Seen], UInt8]] = {
     "albedo": albedo,
     "normal": normal,
     "snow": snow,
+    "sun": sun,
+    "surfel_albedo": preview_surfels.albedo,
+    "surfel_normal": preview_surfels.normal,
+    "surfel_snow": preview_surfels.snow,
+    "surfel_sun": preview_surfels.sun,
     "voxels": voxels,
     "sectors": sectors,
-    "sun": sun,
+    "residency": residency,
 }

@@ -35,9 +35,10 @@ async def preview(request: Request, service: ServiceDep, query: Annotated[Previe
     `ao=on` dims indirect light by what stands within 3 m, which a volume's voxels cannot see. Against the path tracer it mends corners;
     where the volumes are too dark already, as under an overcast sky, it makes them darker. The decals of `/v1/decals` dim it besides.
 
-    `view`, instead of the light: `albedo`, `normal`, `snow` (how much would stay), `sun` (what it reaches), `sectors`, `voxels` (the class
-    of the one in front of each surface); `probes` within 60 m of the eye as spheres that show their light, or the colours of their
-    `rooms`.
+    `view`, instead of the light: `albedo`, `normal`, `snow` (how much would stay), `sun` (what it reaches) of surfaces, and the same as
+    `surfel_albedo`, `surfel_normal`, `surfel_snow`, `surfel_sun` (the share that baked directions give) of the surfels that stand for them
+    in the eye's sector and those around it; `sectors`, and their `residency` in the live world; `voxels` (the class of the one in front of
+    each surface); `probes` within 60 m of the eye as spheres that show their light, or the colours of their `rooms`.
     """
     async with service.preview_thread():
         if await request.is_disconnected():  # a picture takes seconds: not for nobody
@@ -49,6 +50,8 @@ def _reply(request: Request, service: Service, query: PreviewQuery) -> Response:
     light = service.lighting(query.time, query.weather)
     # The far view gets better when the same bake is run again, and nothing else of the dataset changes.
     identity = service.light_identity, service.dataset.distant_bytes
+    if query.view == "residency":  # of this moment
+        return Response(picture(service, query, light), media_type="image/png", headers={"Cache-Control": "no-store"})
     etag = strong_etag("preview", REPLY_VERSION, *identity, light.digest, query.model_dump(exclude={"time", "weather"}))
     return conditional(request, etag, lambda: Body(picture(service, query, light), "image/png"))
 
@@ -60,7 +63,8 @@ def picture(service: Service, query: PreviewQuery, light: Lighting) -> bytes:
     with service.preview_turn():
         if query.view != "lit":
             scene = service.preview_scenes.around(camera.eye, camera.look)
-            return tonemap.png_file(preview_views.draw(query.view, service.engine, scene, camera, light))
+            residency = service.live.residency()
+            return tonemap.png_file(preview_views.draw(query.view, service.engine, scene, camera, light, residency))
         if query.gi == "error":
             return tonemap.png_file(error_picture(service, camera, light, look))
         scene = service.preview_scenes.around(camera.eye, camera.look)

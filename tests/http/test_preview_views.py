@@ -15,15 +15,19 @@ from gi_core.engine import Distant, LitProbes
 from gi_core.errors import OutsideWorldError
 from gi_core.grid import SectorIndex, volume_first_voxel, voxel_centre
 from gi_core.lighting import DirectionalLight, Lighting
+from gi_core.sun_table import SunTable
+from gi_core.world import Location
 from server import preview_views, tonemap
 from server.camera import Camera
 from server.labels import LABEL_PIXELS, with_key
 from server.preview_scene import PreviewScene
+from server.preview_seen import NO_SURFACE
+from server.preview_surfels import NO_SURFEL
 from server.preview_views import (
-    NO_SURFACE,
     OUTDOORS_COLOUR,
     PROBE_ALBEDO,
     PROBE_RADIUS_M,
+    RESIDENCY_COLOURS,
     SECTOR_COLOURS,
     SUN_COLOURS,
     VIEWS,
@@ -62,7 +66,9 @@ class Engine:
     """What views use of one. probe_at : (3,) [m] of one probe, whose six faces are 100 to 600 lx"""
 
     def __init__(self, voxel_class: int = VOXEL_OUTDOORS, probe_at: tuple[float, float, float] | None = None, room: int = 0) -> None:
-        self.dataset = SimpleNamespace(world=SimpleNamespace(bounds=np.array([[-20.0, 0, -20], [20, 10, 20]]), rooms=(), decals=()))
+        self.dataset = SimpleNamespace(
+            world=SimpleNamespace(bounds=np.array([[-20.0, 0, -20], [20, 10, 20]]), rooms=(), decals=(), sectors={})
+        )
         self.lamps = ()
         self.voxel_class, self.probe_at, self.room = voxel_class, probe_at, room
 
@@ -138,6 +144,61 @@ def test_sectors_are_a_checkerboard_with_lines() -> None:
     assert drawn("sectors", down(10, z=0.0))[MIDDLE].tolist() == [30, 30, 30]
 
 
+class Baked(Engine):
+    """One whose sectors are baked, each with a surfel of albedo 0.2 on the floor, one of 0.5 on the roof, and one that faces down there."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        table = SunTable.build(Location(40.7, -74.0, 0.0, "America/New_York", 0.0), 45.0, 90.0)
+        visible = np.zeros((table.plane_count, 1), np.uint32)
+        visible[:] = 0b010
+        sector = SimpleNamespace(
+            surfel_count=3,
+            surfel_position=np.array([[10, 0, 4], [54, 10, 4], [54, 10, 4.2]], np.float32),  # sector-local, of 0,0 and of -1,0
+            surfel_normal=np.array([[0, 1, 0], [0, 1, 0], [0, -1, 0]], np.float32),
+            surfel_albedo=np.array([[0.2] * 3, [0.5] * 3, [0.8] * 3], np.float32),
+            surfel_snow=np.array([0.25, 1.0, 0.0], np.float32),
+            brick_level=np.zeros(2, np.uint8),
+            brick_starts=np.array([0, 1, 3]),
+            sun_visibility=visible,
+        )
+        self.dataset.sector = lambda _: sector
+        world = self.dataset.world
+        world.sectors, world.sun_table, world.sky, world.sky_patches = (
+            {SectorIndex(0, 0): None, SectorIndex(-1, 0): None},
+            table,
+            "faces",
+            6,
+        )
+
+
+@pytest.mark.parametrize(
+    ("view", "floor", "roof", "ceiling"),
+    [
+        ("surfel_albedo", (124,) * 3, (188,) * 3, (231,) * 3),
+        ("surfel_normal", (128, 255, 128), (128, 255, 128), (128, 0, 128)),
+        ("surfel_snow", (64,) * 3, (255,) * 3, (0,) * 3),
+        ("surfel_sun", (0,) * 3, (255,) * 3, (0,) * 3),
+    ],
+)
+def test_surfaces_have_the_colours_of_their_surfels(view: str, floor: tuple, roof: tuple, ceiling: tuple) -> None:
+    def middle(camera: Camera) -> tuple[int, ...]:
+        return tuple(drawn(view, camera, engine=Baked())[MIDDLE].tolist())
+
+    assert middle(down(10)) == floor
+    assert middle(down(-10, y=14.0)) == roof
+    assert middle(Camera(np.array([-10.0, 5, 4.2]), np.array([-10.0, 10, 4.2]), 20.0, WIDTH)) == ceiling
+    assert middle(down(15)) == NO_SURFEL  # 5 m from the only one
+
+
+def test_residency_is_the_live_world_s() -> None:
+    seen = {SectorIndex(0, 0): "read by a player", SectorIndex(-1, 0): "failed"}
+    for x, word in ((10.0, "read by a player"), (-10.0, "failed")):
+        picture = preview_views.draw("residency", Engine(), scene(), down(x), light(), seen)
+        assert picture[MIDDLE].tolist() == list(RESIDENCY_COLOURS[word])
+    assert drawn("residency", down(10))[MIDDLE].tolist() == list(RESIDENCY_COLOURS["not resident"])
+
+
 @pytest.mark.parametrize("voxel_class", [VOXEL_SOLID, VOXEL_OUTDOORS, VOXEL_INDOORS, VOXEL_NO_SECTOR])
 def test_a_surface_has_the_colour_of_the_voxel_before_it(voxel_class: int) -> None:
     picture = drawn("voxels", down(10), engine=Engine(voxel_class))
@@ -188,8 +249,12 @@ def test_the_route_draws_each_view(http: httpx.Client) -> None:
         reply = http.get("/v1/preview.png", params={**QUERY, "view": view})
         assert reply.status_code == 200, reply.text
         assert np.asarray(Image.open(io.BytesIO(reply.content))).shape == (18, 32, 3)
+        if view == "residency":
+            assert reply.headers["cache-control"] == "no-store"
+            assert "etag" not in reply.headers
+            continue
         bodies.add((reply.headers["etag"], reply.content))
-    assert len(bodies) == len({etag for etag, _ in bodies}) == 9
+    assert len(bodies) == len({etag for etag, _ in bodies}) == len(VIEWS)
 
 
 def test_errors_have_no_other_view(http: httpx.Client) -> None:
