@@ -4,6 +4,7 @@ SECTOR_SIZE_M = 64.0  # (contract) edge of a sector column; slide "Sector layout
 VOXEL_SIZE_M = 3.125  # (contract) 100 m / 32; slide "Irradiance volume"
 FINE_VOXEL_SIZE_M = VOXEL_SIZE_M / 2  # (contract) of cascade -1
 VOLUME_SHAPE = (16, 32, 32)  # (contract) y, z, x
+MAX_CASCADE = 3  # (contract) 800 m wide: some 190 sectors
 MAX_PROBES_PER_SECTOR = 1000  # (contract) slide "Sector layout"
 SKY_SHAPE = (64, 128)  # (contract) rows (polar angle from +Y), columns (from +X towards +Z)
 

@@ -14,6 +14,7 @@ from pydantic_core import PydanticCustomError
 from starlette.requests import HTTPConnection
 
 from gi_core.arrays import Float64
+from gi_core.constants import MAX_CASCADE
 from gi_core.distant_file import DistantLight
 from gi_core.errors import InputError
 from gi_core.json_fields import LARGEST_INTEGER
@@ -27,7 +28,6 @@ MAX_COORDINATE_M = 1e7
 MAX_PROBE_RADIUS_M = 100.0  # at most 5 x 5 sectors, 25 000 probes
 MAX_DECAL_RADIUS_M = 500.0  # of the talk's 22 300 vehicles on 6 km2 some 3 000
 MAX_PREVIEW_WIDTH = 1920
-MAX_CASCADE = 3  # 800 m wide: some 190 sectors
 
 Coordinate = Annotated[float, Field(ge=-MAX_COORDINATE_M, le=MAX_COORDINATE_M, allow_inf_nan=False, description="world metres")]
 
@@ -183,7 +183,10 @@ class PreviewQuery(LightingQuery):
     gi: Literal["on", "off", "split", "error"] = Field(
         "on", description="off: direct light only; split: left off, right on; error: against a path tracer, in false colour"
     )
-    distant: Beyond = Field("on", description="beyond the volumes: the distant texture, or off; client: beyond the eye's one volume")
+    distant: Beyond = Field(
+        "on",
+        description="beyond the volumes: the distant texture, or off; client: beyond the eye's one; cascades: beyond coarser ones",
+    )
     distant_light: DistantLight | None = Field(
         None, description="of the distant texture the sky's light alone, or with sun, lamps and bounces; none: the best that was baked"
     )
@@ -200,7 +203,7 @@ class PreviewQuery(LightingQuery):
     @model_validator(mode="after")
     def _one_kind(self) -> "PreviewQuery":
         if self.distant_light is not None and self.distant == "off":
-            raise ValueError("distant_light with distant=on or client only")
+            raise ValueError("distant_light with distant=on, client or cascades only")
         if self.gi == "error" and self.view != "lit":
             raise ValueError("either gi=error or another view than lit, not both")
         return self

@@ -5,7 +5,8 @@
     up to FADE_M beyond    its edge, faded into the texture
     farther                the texture alone
 
-A client has one volume, around its player; a picture may take as many as its pixels need.
+A client has one volume around its player, or cascades one in another, each fading into the next; a picture may take as many volumes as its
+pixels need.
 """
 
 from collections.abc import Callable, Iterator
@@ -17,7 +18,7 @@ import numpy as np
 from gi_core import ambient_cube
 from gi_core.arrays import Float32, Float64, Int64
 from gi_core.basis import average
-from gi_core.constants import ROOM_OUTDOORS, SECTOR_SIZE_M, VOLUME_SHAPE, VOXEL_SIZE_M
+from gi_core.constants import MAX_CASCADE, ROOM_OUTDOORS, SECTOR_SIZE_M, VOLUME_SHAPE, VOXEL_SIZE_M
 from gi_core.distant_file import DistantLight
 from gi_core.engine import Distant, Engine
 from gi_core.errors import InputError
@@ -28,7 +29,7 @@ from gi_core.volume import Volume, sample_coefficients, sample_volume
 from gi_core.world import Decal, Room
 
 Indirect = Literal["on", "off", "split"]
-Beyond = Literal["on", "off", "client"]
+Beyond = Literal["on", "off", "client", "cascades"]
 # The served volume around a place, of the room that a number says; 0 is outdoors.
 VolumeAt = Callable[[Float64, int], Volume]
 
@@ -57,7 +58,7 @@ class Look:
 
     indirect : where indirect light is drawn; split: in the right half only
     distant : what lies beyond the volumes; on: the distant texture, off: the nearest volume's edge, client: the texture beyond the one
-        volume around the eye
+        volume around the eye, cascades: beyond the coarser ones around that
     occlusion : whether what stands near, and decals, dim it
     interior : whether rooms are lit by their interior volumes, or by the outdoor one
     distant_light : what the distant texture knows: the sky alone, or all light; None is the best that was baked
@@ -82,6 +83,7 @@ class ServedLight:
     player : (3,) [m], the one place that there is a volume around; None: as many as points need, at most MAX_VOLUMES
     rooms : of the world; what lies in one reads its interior volume, and nothing beyond it but through an opening
     decals : of the world; they dim indirect light where a picture asks for occlusion
+    coarser : cascades around ``player``, the next after the volume first
     """
 
     volume_at: VolumeAt
@@ -89,6 +91,7 @@ class ServedLight:
     player: Float64 | None = None
     rooms: tuple[Room, ...] = ()
     decals: tuple[Decal, ...] = ()
+    coarser: tuple[Volume, ...] = ()
 
     @classmethod
     def of(cls, engine: Engine, lighting: Lighting, look: Look, eye: Float64, settings: Settings = NEUTRAL) -> "ServedLight":
@@ -106,8 +109,10 @@ class ServedLight:
                 return replace(outdoors, values=np.zeros_like(outdoors.values))
 
         distant = None if look.distant == "off" else engine.distant(settings.light(lighting), look.distant_light)
-        world = engine.dataset.world
-        return cls(volume_at, distant, eye if look.distant == "client" else None, world.rooms if look.interior else (), world.decals)
+        world, coarser = engine.dataset.world, range(1, MAX_CASCADE + 1) if look.distant == "cascades" else ()
+        cascades = tuple(engine.volume(np.clip(eye, low, high), lighting, settings, cascade=n) for n in coarser)
+        player = eye if look.distant in ("client", "cascades") else None
+        return cls(volume_at, distant, player, world.rooms if look.interior else (), world.decals, cascades)
 
     def irradiance(self, position: Float64, normal: Float32) -> Float32:
         """(n, 3) [lx] on surface points (n, 3) [m] with normals (n, 3), as a client samples it."""
@@ -115,14 +120,29 @@ class ServedLight:
         points = position + SAMPLE_OFFSET_M * normal
         result = np.zeros((len(points), 3), np.float32)
         for volume, some, share, is_room in self._parts(points, position + SURFACE_OFFSET_M * normal, MAX_VOLUMES):
-            light = sample_volume(volume.values, volume.origin, volume.voxel_size, position[some], normal[some])
-            if self.distant is not None and not is_room:
-                near = near_share(volume.origin, points[some])
-                far = np.flatnonzero(near < 1)
-                beyond = ambient_cube.evaluate(sample_distant(self.distant, points[some[far]]), normal[some[far]])
-                light[far] += (1 - near[far])[:, None] * (beyond - light[far])
+            if is_room:
+                light = sample_volume(volume.values, volume.origin, volume.voxel_size, position[some], normal[some])
+            else:
+                light = self._outdoors((volume, *self.coarser), position[some], normal[some])
             result[some] += share[:, None] * light
         return result
+
+    def _outdoors(self, volumes: tuple[Volume, ...], position: Float64, normal: Float32) -> Float32:
+        """(n, 3) [lx] on surface points (n, 3) [m] with normals (n, 3): the first volume's, then the others', then the texture's."""
+        volume, *coarser = volumes
+        light = sample_volume(volume.values, volume.origin, volume.voxel_size, position, normal)
+        if not coarser and self.distant is None:
+            return light
+        points = position + volume.voxel_size / 4 * normal
+        near = cascade_share(volume, points) if coarser else near_share(volume.origin, points, float(volume.voxel_size[0]))
+        far = np.flatnonzero(near < 1)
+        if coarser:
+            beyond = self._outdoors(tuple(coarser), position[far], normal[far])
+        else:
+            assert self.distant is not None
+            beyond = ambient_cube.evaluate(sample_distant(self.distant, points[far]), normal[far])
+        light[far] += (1 - near[far])[:, None] * (beyond - light[far])
+        return light
 
     def mean_irradiance(self, points: Float64) -> tuple[Float32, Float32]:
         """Of points (n, 3) [m] in the air: the mean over directions (n, 3) [lx], and how far volumes know it, ``near_share`` (n,).
@@ -155,10 +175,18 @@ class ServedLight:
                     yield volume, some, share[some], number != ROOM_OUTDOORS
 
 
-def near_share(origin: Float64, points: Float64) -> Float32:
+def cascade_share(volume: Volume, points: Float64) -> Float32:
+    """How much of the light of points (n, 3) [m] is their cascade's and not the next one's: 1 from the second of its voxels' centres on
+    inwards, 0 from the outermost. (n,)"""
+    place = (points - volume.origin) / volume.voxel_size
+    inside = np.minimum(place, EXTENT_M / VOXEL_SIZE_M - place).min(axis=1)
+    return np.asarray(np.clip(inside / 2, 0, 1), np.float32)
+
+
+def near_share(origin: Float64, points: Float64, voxel_size_m: float = VOXEL_SIZE_M) -> Float32:
     """How much of the light of points (n, 3) [m] is their volume's: 1 between its voxel centres, of which the first is at ``origin``
     (3,) [m], 0 from FADE_M beyond them. (n,)"""
-    beyond = np.linalg.norm(points - np.clip(points, origin, origin + EXTENT_M), axis=1)
+    beyond = np.linalg.norm(points - np.clip(points, origin, origin + EXTENT_M * (voxel_size_m / VOXEL_SIZE_M)), axis=1)
     return np.asarray(np.clip(1 - beyond / FADE_M, 0, 1), np.float32)
 
 

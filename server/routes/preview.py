@@ -28,8 +28,9 @@ async def preview(request: Request, service: ServiceDep, query: Annotated[Previe
     `gi=off`: direct light only; `split`: left off, right on; `error`: the indirect light's error against a path tracer in false colour
     (blue: too dark, red: too bright, by half and more), which takes some seconds.
     `distant`: beyond the volumes the texture of /v1/distant takes over (`on`), or not (`off`: the nearest volume's edge). A picture takes
-    as many volumes as its pixels need, up to 128; `client` shows what one has who holds only the volume around the eye. Of the texture
-    `distant_light=sky` takes the sky's light alone, as in the talk, `full` all of it; left out it is the best that was baked.
+    as many volumes as its pixels need, up to 128; `client` shows what one has who holds only the volume around the eye, `cascades` who
+    holds three coarser ones around that, up to 800 m wide, each fading into the next. Of the texture `distant_light=sky` takes the sky's
+    light alone, as in the talk, `full` all of it; left out it is the best that was baked.
     `interior=off` lights rooms by the outdoor volume, as one sees them who never asks for `kind=interior`.
 
     `ao=on` dims indirect light by what stands within 3 m, which a volume's voxels cannot see. Against the path tracer it mends corners;

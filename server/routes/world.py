@@ -5,13 +5,13 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Request, Response
 
 from gi_core.basis import served_from
-from gi_core.constants import MAX_PROBES_PER_SECTOR, ROOM_OUTDOORS, SECTOR_SIZE_M, VOLUME_SHAPE, VOXEL_SIZE_M
+from gi_core.constants import MAX_CASCADE, MAX_PROBES_PER_SECTOR, ROOM_OUTDOORS, SECTOR_SIZE_M, VOLUME_SHAPE, VOXEL_SIZE_M
 from gi_core.dataset import Dataset, WorldInfo
 from gi_core.errors import FormatError
 from gi_core.weather import WEATHER_RANGES, weather_presets
 from gi_core.world import Room
 from server.caching import Body, conditional, strong_etag
-from server.dependencies import MAX_CASCADE, MAX_DECAL_RADIUS_M, MAX_PREVIEW_WIDTH, MAX_PROBE_RADIUS_M, NoQuery, ServiceDep
+from server.dependencies import MAX_DECAL_RADIUS_M, MAX_PREVIEW_WIDTH, MAX_PROBE_RADIUS_M, NoQuery, ServiceDep
 from server.encoding import REPLY_VERSION
 from server.live_state import MAX_BOXES, MAX_LAMPS
 from server.models import BoundsReply, DoorReply, LimitsReply, LocationReply, OpeningReply, RoomReply, SectorGridReply, WorldReply, vector3

@@ -214,7 +214,7 @@ def test_a_picture_shows_the_distant_light_that_it_is_asked_for(http: httpx.Clie
     assert (pictures["full"] >= pictures["sky"]).all()
     assert (pictures["full"] > pictures["sky"]).mean() > 0.2
     reply = http.get("/v1/preview.png", params={**moment, **FROM_ABOVE, "distant": "off", "distant_light": "sky"})
-    assert (reply.status_code, "distant_light with distant=on or client only" in reply.text) == (400, True)
+    assert (reply.status_code, "distant_light with distant=on, client or cascades only" in reply.text) == (400, True)
 
 
 def test_probes_are_within_the_radius(http: httpx.Client, moment: dict[str, Any], place: dict[str, Any]) -> None:

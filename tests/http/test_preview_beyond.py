@@ -44,6 +44,26 @@ def test_the_one_volume_of_a_client_fades_into_the_texture() -> None:
     np.testing.assert_allclose(known, 1 - np.clip(beyond / FADE_M, 0, 1), atol=1e-5)
 
 
+def test_cascades_fade_into_one_another_and_the_last_into_the_texture() -> None:
+    def cascade(n: int) -> Served:
+        volume = Served(np.zeros(3), 0)
+        volume.values = np.full_like(volume.values, NEAR + 100 * n)
+        volume.voxel_size = np.full(3, VOXEL_SIZE_M * 2.0**n)
+        volume.origin = -(np.array([VOLUME_SHAPE[2], VOLUME_SHAPE[0], VOLUME_SHAPE[1]]) - 1) / 2 * volume.voxel_size
+        return volume
+
+    volumes = [cascade(n) for n in range(4)]
+    served = ServedLight(lambda *_: volumes[0], texture(np.full((30, 30), FAR), (-15, -15)), np.zeros(3), coarser=tuple(volumes[1:]))
+    points, normals = along_x(0, 500, 1001)
+    seen, edge = served.irradiance(points, normals)[:, 0], EXTENT_M[0] / 2
+    # In the middle of each, at its edge, where the next one is all there is, and beyond the last.
+    for x, lux in ((0, 300), (edge, 400), (2 * edge, 500), (4 * edge, 600), (8 * edge, 600), (8 * edge + FADE_M + 1, FAR)):
+        np.testing.assert_allclose(served.irradiance(*along_x(x, x, 1))[:, 0], lux, rtol=1e-5)
+    np.testing.assert_allclose(served.irradiance(*along_x(edge - VOXEL_SIZE_M, 0, 1))[:, 0], 350, rtol=1e-5)
+    assert (np.diff(seen) >= -1e-3).all()
+    assert np.abs(np.diff(seen)).max() < 10
+
+
 def test_without_a_texture_the_edge_goes_on() -> None:
     points, normals = along_x(0, 1000, 50)
     np.testing.assert_allclose(ServedLight(Served, None, np.zeros(3)).irradiance(points, normals), NEAR, rtol=1e-6)
