@@ -2,11 +2,12 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from bake_jobs.adaptive import NEAR_SURFACE_M
+from bake_jobs.adaptive import NEAR_SURFACE_M, _importance
 from bake_jobs.config import ADAPTIVE, settings_for, with_target_error
 from bake_jobs.placement import Placement
 from bake_jobs.scene import ProbeHint
@@ -207,6 +208,16 @@ def test_what_is_forbidden_beats_what_is_added_and_solids_are_told(build):
         assert not within(placed(replace(street(build), hints=hints), **knobs).position, *box).any()
     tower = build().ground().box((20, 0, 20), (36, 80, 36)).scene()
     assert placed(replace(tower, hints=(ProbeHint("add", (22.0, 10.0, 22.0), (34.0, 20.0, 34.0), 4.0),))).dead == 27
+
+
+def test_what_players_see_weighs_more_than_the_air_above_it():
+    height, clearance = np.array([1.0, 6.0, 17.0, 28.0, 40.0, 1.0, 40.0]), np.array([1.0, 1.0, 1.0, 1.0, 1.0, 5.0, 1.0])
+    room = np.array([0, 0, 0, 0, 0, 0, 3], np.uint16)
+    air = SimpleNamespace(height=height, room=room, centre=np.zeros((7, 3)))
+    found = _importance(air, SimpleNamespace(clearance=clearance), (), 28.0)
+    np.testing.assert_allclose(found, [1, 1, 0.8, 0.6, 0.6, 0.2, 1], atol=1e-6)
+    dense = _importance(air, SimpleNamespace(clearance=clearance), (ProbeHint("densify", (-1, -1, -1), (1, 1, 1)),), 28.0)
+    np.testing.assert_allclose(dense, 8 * found)
 
 
 def test_a_budget_is_kept_and_the_border_comes_first(build, west_and_east):

@@ -401,3 +401,19 @@ def test_a_picture_shows_a_room_without_its_interior_volume(http: httpx.Client, 
     look |= {"time": noon["time"], "weather": noon["weather"]}
     with_it, without = (Image.open(io.BytesIO(http.get("/v1/preview.png", params=look | {"interior": on}).content)) for on in ("on", "off"))
     assert np.asarray(without).mean() > 1.5 * np.asarray(with_it).mean() > 0
+
+
+def test_what_compare_measured_is_quoted(serving: Any, city: Path, tmp_path: Path, noon: Place) -> None:
+    measured = tmp_path / "measured"
+    shutil.copytree(city, measured)
+    world = Dataset.open(city).world
+    stage = "shaded" if world.basis == "cube" else "shaded_cube"
+    report = {"states": {"noon": {stage: {"median": 0.03}}, "overcast": {stage: {"median": 0.05}}}, "expected_error": 0.04}
+    write_world(measured, replace(world, error_report=report))
+    with serving(create_app(measured, Settings())) as client:
+        assert client.get("/v1/world").json()["dataset"]["error_report"] == report
+        assert get(client, noon)[1]["expected_error"] == pytest.approx(0.04)
+        assert get(client, noon, cascade=1)[1]["expected_error"] is None
+    with serving(create_app(city, Settings())) as client:
+        assert client.get("/v1/world").json()["dataset"]["error_report"] is None
+        assert get(client, noon)[1]["expected_error"] is None
