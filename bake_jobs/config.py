@@ -194,8 +194,8 @@ ADAPTIVE: dict[str, Any] = {
     "voxel_candidates": 24,
     "margin_m": 3.2,
 }
-# Light errs most at hours between those that are baked. Half the talk's steps both ways take a tenth off that error and its 95th percentile,
-# for an eighth more bytes and not a microsecond of a tick (docs/TRADEOFF.md, "Any sun").
+# Light errs most at hours between those that are baked. Half the talk's steps both ways take a tenth off that error and its 95th
+# percentile, for an eighth more bytes and not a microsecond of a tick (docs/TRADEOFF.md, "Any sun").
 FINE_SUNS: dict[str, Any] = {"sun_declination_step_degrees": 8.0, "sun_hour_step_degrees": 7.5}
 
 

@@ -14,6 +14,7 @@ Lighting belongs to the world: players share lit sectors, only volumes are their
 anybody's. No file is read and no kernel compiled in it, once ``warm_up`` has run.
 """
 
+import logging
 import threading
 import time
 from collections.abc import Callable, Collection, Sequence
@@ -32,6 +33,7 @@ from gi_core.basis import conversion
 from gi_core.constants import BASIS_SIZES, VOLUME_SHAPE
 from gi_core.dataset import Dataset
 from gi_core.device import Device
+from gi_core.errors import SectorlightError
 from gi_core.geometry_file import Geometry
 from gi_core.grid import SectorIndex, volume_first_voxel
 from gi_core.layout import DIRECTIONAL_LIGHT, MAX_DIRECTIONAL_LIGHTS
@@ -53,6 +55,9 @@ from gi_core.tick_plan import PLACES, plan_tick
 from gi_core.volume import box_record, plan_boxes
 from gi_core.world import Lamp
 
+log = logging.getLogger("sectorlight.live")
+
+NO_TRIANGLES = Geometry(np.zeros((0, 3)), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32))
 DEFAULT_BUDGET_BYTES = 512 << 20
 # A tick with sectors to relight or volumes to fill leaves planning to later ones, at most so often on end. Sectors are planned for seconds
 # ahead.
@@ -125,7 +130,7 @@ class LiveWorld:
         self._places = places
         conversion(dataset.world.basis, basis)
         self.basis = basis
-        self._geometry = ShadowGeometry(dataset.geometry, dataset.world.sectors)
+        self._geometry = ShadowGeometry(self._read_geometry, dataset.world.sectors)
         self._tracing = threading.Lock()
         self._right_of_way = RightOfWay()
         options = stream or StreamOptions(budget_bytes)
@@ -251,6 +256,15 @@ class LiveWorld:
             if self._shadows is not None and light.sun_is_up:
                 placed.make_room_for_samples()
         return placed
+
+    def _read_geometry(self, index: SectorIndex) -> Geometry:
+        """A sector's triangles; none, and a line in the log, where its file is damaged: lamps then shine through what stands there, and
+        ticks go on."""
+        try:
+            return self.dataset.geometry(index)
+        except SectorlightError as error:
+            log.warning("lamps have no shadows of sector %s: %s", f"{index.x},{index.z}", error)
+            return NO_TRIANGLES
 
     def _new_sector(self, sector: Sector) -> LiveSector:
         return LiveSector(self._device, sector, self.dataset.world.sky_patches, self._geometry, self._tracing)

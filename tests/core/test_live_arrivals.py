@@ -9,7 +9,7 @@ import pytest
 from live_run import EAST, GOLDEN, LATE_S, STREET, Run, at, is_exact, light_of
 
 from gi_core import live_world, stream
-from gi_core.dataset import Dataset, sector_path
+from gi_core.dataset import Dataset, geometry_path, sector_path
 from gi_core.engine import Engine
 from gi_core.grid import SectorIndex
 from gi_core.live_sector import FADE_TICKS
@@ -47,6 +47,20 @@ def test_a_sector_is_lit_when_it_arrives(world, engine, monkeypatch):
     for before, sector in zip(arrived, residents.values(), strict=True):
         after = sector.resident.read_cubes()
         assert np.abs(before - after).max() <= 0.005 * after.max()
+
+
+def test_a_damaged_geometry_file_costs_shadows_and_no_tick(tmp_path, engine, caplog):
+    shutil.copytree(GOLDEN, tmp_path / "city")
+    path = geometry_path(tmp_path / "city", SectorIndex(0, 0))
+    path.write_bytes(path.read_bytes()[:200])
+    world = LiveWorld(Dataset.open(tmp_path / "city"), shadow_map=False)
+    try:
+        run, flare = Run(world), Lamp("flare", "point", (5.0, 3.0, 30.0), 1e9)
+        lit = run.settle(at(STREET), light_of(world, engine.lighting("23:30", "clear"), (flare,)))
+        assert lit.max() > 1000
+        assert [record.getMessage() for record in caplog.records if "no shadows of sector 0,0" in record.getMessage()]
+    finally:
+        world.close()
 
 
 def test_a_lamp_that_was_lit_while_a_sector_loaded_reaches_it(world, engine):
