@@ -11,7 +11,7 @@ A tick, in order:
     shadow map   draw some more of the next one; sectors take samples of one that was just drawn
 
 Lighting belongs to the world: players share lit sectors, only volumes are theirs. One thread calls ``tick``; what it publishes is
-anybody's. No file is read and no kernel compiled in it, once ``warm_up`` has run.
+anybody's. No kernel is compiled in it, once ``warm_up`` has run, and no file read but of triangles that a lamp is the first to ask for.
 """
 
 import logging

@@ -8,7 +8,6 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from gi_core import relight_twin
 from gi_core.arrays import Float32, Float64, Int64, UInt8
@@ -48,6 +47,9 @@ def drawn(seen: Seen, colours: Colours) -> UInt8:
 def nearest_surfels(sector: Sector, position: Float64, normal: Float32) -> Int64:
     """(n,) the surfel for each of some points (n, 3) [m], sector-local, with normals (n, 3); -1 where there is none within NEAR_M and half
     a cell of its own."""
+    # A view for debugging is no reason for every server to hold 24 MB more.
+    from scipy.spatial import cKDTree
+
     if not sector.surfel_count:
         return np.full(len(position), -1, np.int64)
     tree = cKDTree(np.hstack([sector.surfel_position, TURNED_M / 2 * sector.surfel_normal]))
