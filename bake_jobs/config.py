@@ -43,6 +43,14 @@ KNOB_RANGES = {
     "sun_declination_step_degrees": (1, 46),
     "sun_hour_step_degrees": (1, 90),
 }
+# Without which a knob does nothing, whatever it is turned to; turned off it needs nothing.
+KNOB_NEEDS = {
+    "wall_weights": "voxel_weights=fitted",
+    "far_feedback": "voxel_weights=fitted",
+    "target_error": "placement=adaptive",
+    "reader_probes": "placement=adaptive",
+}
+TURNED_OFF = (None, "nearest", "closest", 0)
 
 
 @dataclass(frozen=True)
@@ -169,15 +177,10 @@ def with_knobs(settings: BakeSettings, knobs: Sequence[str]) -> BakeSettings:
 
 def _expect_effect(settings: BakeSettings, turned: Mapping[str, object]) -> None:
     """Raise InputError for a knob that was turned and that others leave without effect, and for a margin that placement cannot have."""
-    needs: dict[str, tuple[object, str, object]] = {
-        "wall_weights": ("fitted", "voxel_weights", "fitted"),
-        "far_feedback": ("likest", "voxel_weights", "fitted"),
-        "target_error": (turned.get("target_error"), "placement", "adaptive"),
-        "reader_probes": (turned.get("reader_probes") or None, "placement", "adaptive"),
-    }
-    for name, (value, other, wanted) in needs.items():
-        if turned.get(name) is not None and turned[name] == value and getattr(settings, other) != wanted:
-            raise InputError(f"knob {name}={value}: does nothing without {other}={wanted}")
+    for name, need in KNOB_NEEDS.items():
+        other, _, wanted = need.partition("=")
+        if turned.get(name) not in TURNED_OFF and getattr(settings, other) != wanted:
+            raise InputError(f"knob {name}={turned[name]}: does nothing without {need}")
     if settings.placement == "adaptive" and settings.margin_m > MAX_ADAPTIVE_MARGIN_M:
         raise InputError(
             f"knob placement=adaptive: expected margin_m of {MAX_ADAPTIVE_MARGIN_M:g} at most, found {settings.margin_m:g}; "

@@ -7,7 +7,6 @@ system that the file's ``crs`` member names.
 """
 
 import re
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +22,7 @@ from bake_jobs.table import read_json
 from bake_jobs.terrain import MAX_CELLS, Terrain, cells_needed, terrain_under
 from gi_core.arrays import Float32, Float64
 from gi_core.errors import SourceError
+from gi_core.json_fields import is_finite
 from gi_core.world import Location
 
 LEVEL_HEIGHT_M = 3.2
@@ -164,7 +164,7 @@ def _metres(properties: dict[str, Any], key: str, where: str) -> float | None:
         return None
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise SourceError(f"{where}: expected {key} to be a number of metres, found {value!r}")
-    return float(value) if abs(value) <= sys.float_info.max else None
+    return float(value) if is_finite(value) else None
 
 
 def _refuse_bad_places(lonlat: Float64, path: Path) -> None:

@@ -12,7 +12,7 @@ from bake_jobs.config import BakeSettings
 from bake_jobs.inside import Solids
 from bake_jobs.rays import SURFACE_OFFSET_M, RayScene
 from bake_jobs.scene import ProbeHint
-from gi_core.arrays import Bool, Float64, Int64, UInt8, UInt16
+from gi_core.arrays import AnyArray, Bool, Float64, Int64, UInt8, UInt16
 from gi_core.constants import MAX_PROBES_PER_SECTOR, ROOM_OUTDOORS, SECTOR_SIZE_M, VOXEL_SIZE_M
 from gi_core.grid import SectorIndex, voxel_centre
 from gi_core.rooms import holds, rooms_of
@@ -111,6 +111,11 @@ def _lattice(low: float, high: float, spacing: float) -> Float64:
     """Multiples of the spacing plus one half of it within [low, high)."""
     first, last = (int(np.ceil(edge / spacing - 0.5)) for edge in (low, high))
     return np.asarray((np.arange(first, last) + 0.5) * spacing, np.float64)
+
+
+def _points(x: AnyArray, y: AnyArray, z: AnyArray) -> AnyArray:
+    """Points (n, 3) of a lattice whose lines stand at these places along each axis."""
+    return np.stack([a.ravel() for a in np.meshgrid(x, y, z, indexing="ij")], axis=1)
 
 
 def _march(ray_scene: RayScene, origins: Float64, direction: tuple[float, float, float], reach: float) -> tuple[Float64, Float64]:
@@ -217,7 +222,7 @@ def asked_positions(ray_scene: RayScene, hints: tuple[ProbeHint, ...], low: Floa
         y = hint.minimum[1], hint.maximum[1]
         if hint.kind == "add":
             lines = [_lattice(start, end, hint.spacing_m) for start, end in (x, y, z)]
-            found.append(np.stack([a.ravel() for a in np.meshgrid(*lines, indexing="ij")], axis=1))
+            found.append(_points(*lines))
         elif hint.kind == "walls" and x[0] < x[1] and z[0] < z[1]:
             corners = np.array([x[0], z[0]]), np.array([x[1], z[1]])
             beside = _beside_walls(ray_scene, _lattice(*y, hint.spacing_m), *corners, hint.spacing_m, wall_offset_m)
@@ -238,7 +243,7 @@ def positions_between_voxels(rooms: tuple[Room, ...], low: Float64, high: Float6
             continue
         lines = [_lattice(start, end, APART_IN_ROOMS_M) for start, end in box.T]
         lines = [line if len(line) else np.array([(start + end) / 2]) for line, (start, end) in zip(lines, box.T, strict=True)]
-        position = np.stack([a.ravel() for a in np.meshgrid(*lines, indexing="ij")], axis=1)
+        position = _points(*lines)
         here = ((position[:, [0, 2]] >= low) & (position[:, [0, 2]] < high)).all(axis=1)
         found.append(position[here & (rooms_of(position, rooms) == number)])
     return np.concatenate(found)
@@ -248,14 +253,8 @@ def has_voxels(room: Room) -> bool:
     """Whether a room holds the centre of any voxel."""
     low, high = (np.array(corner) / VOXEL_SIZE_M for corner in (room.minimum, room.maximum))
     lines = [np.arange(int(np.ceil(start - 0.5)), int(np.floor(end - 0.5)) + 1) for start, end in zip(low, high, strict=True)]
-    if any(len(line) == 0 for line in lines):
-        return False
     # Level by level: most rooms have one in their first.
-    for y in lines[1]:
-        lattice = np.stack([a.ravel() for a in np.meshgrid(lines[0], y, lines[2], indexing="ij")], axis=1)
-        if holds(room, voxel_centre(lattice)).any():
-            return True
-    return False
+    return any(holds(room, voxel_centre(_points(lines[0], level, lines[2]))).any() for level in lines[1][:, None])
 
 
 def in_boxes(position: Float64, hints: tuple[ProbeHint, ...], kind: str) -> Bool:

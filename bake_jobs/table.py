@@ -2,13 +2,13 @@
 
 import json
 import math
-import sys
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from gi_core.errors import SourceError
+from gi_core.json_fields import is_finite
 
 Vector = tuple[float, float, float]
 _COUNT_WORDS = {2: "two", 3: "three"}
@@ -121,4 +121,4 @@ def read_json(path: Path, what: str) -> dict[str, Any]:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
+    return isinstance(value, int | float) and not isinstance(value, bool) and is_finite(value)

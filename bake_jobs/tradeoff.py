@@ -45,17 +45,17 @@ KNOBS: dict[str, tuple[str, ...]] = {
 }
 TALK, IDEAS = "talk", "ideas"
 # What BASELINE adds to TALK, an idea at a time; and several feedback probes, which it left out again.
-IDEA_KNOBS: tuple[tuple[str, ...], ...] = (
-    ("sky=patches", "sky_patches=96"),
-    ("cells_double_beyond_m=4",),
-    ("basis=sh2",),
-    ("placement=adaptive", "margin_m=3.2"),
-    ("rays_per_face_edge=12",),
-    ("sun_hour_step_degrees=7.5", "sun_declination_step_degrees=8"),
-    ("voxel_weights=fitted", "voxel_candidates=24"),
-    ("voxel_weights=fitted", "voxel_candidates=24", "wall_weights=fitted"),
-    ("voxel_weights=fitted", "voxel_candidates=24", "far_feedback=likest"),
-    ("feedback_probes=3",),
+IDEA_KNOBS: tuple[str, ...] = (
+    "sky=patches sky_patches=96",
+    "cells_double_beyond_m=4",
+    "basis=sh2",
+    "placement=adaptive margin_m=3.2",
+    "rays_per_face_edge=12",
+    "sun_hour_step_degrees=7.5 sun_declination_step_degrees=8",
+    "voxel_weights=fitted voxel_candidates=24",
+    "voxel_weights=fitted voxel_candidates=24 wall_weights=fitted",
+    "voxel_weights=fitted voxel_candidates=24 far_feedback=likest",
+    "feedback_probes=3",
 )
 
 
@@ -92,7 +92,7 @@ class Sweep:
 def plan(names: Sequence[str] = ()) -> list[Variant]:
     """Presets and KNOBS, or those with some names: a preset's, a group's of KNOBS, a knob's, or IDEAS. Raises InputError for others."""
     everything = [(preset, Variant(preset, preset)) for preset in PRESETS]
-    everything += [(group, _turned(BASELINE, tuple(knobs.split()))) for group, rows in KNOBS.items() for knobs in rows]
+    everything += [(group, _turned(BASELINE, knobs)) for group, rows in KNOBS.items() for knobs in rows]
     if IDEAS in names:
         everything += [(IDEAS, _turned(TALK, knobs)) for knobs in IDEA_KNOBS]
     known = {name for group, variant in everything for name in (group, *variant.knobs)}
@@ -104,8 +104,10 @@ def plan(names: Sequence[str] = ()) -> list[Variant]:
     return [variant for group, variant in everything if not names or {group, *variant.knobs} & set(names)]
 
 
-def _turned(preset: str, knobs: tuple[str, ...]) -> Variant:
-    return Variant(" + ".join((preset, *knobs)), preset, knobs)
+def _turned(preset: str, knobs: str) -> Variant:
+    """A preset with knobs turned that are written one after another."""
+    turned = tuple(knobs.split())
+    return Variant(" + ".join((preset, *turned)), preset, turned)
 
 
 def middle_block(scene: Scene) -> SectorRange:

@@ -98,13 +98,18 @@ class Fields:
         return CorruptFileError(f"{self.where}: {name}: expected {expected}, found {found}; bake it again")
 
 
+def is_finite(number: float) -> bool:
+    """Whether a number is one that a float can hold: JSON and TOML have integers of any size, which math.isfinite does not take."""
+    return abs(number) <= sys.float_info.max
+
+
 def all_finite(value: Any, depth: int = 0) -> bool:
     """Whether free-form JSON can be written again as JSON: no NaN, no infinity, no lone surrogate, nothing that overflows, and not nested
     beyond DEEPEST."""
     if depth > DEEPEST:
         return False
     if isinstance(value, int | float):
-        return abs(value) <= sys.float_info.max
+        return is_finite(value)
     if isinstance(value, str):
         return _encodable(value)
     if isinstance(value, dict):

@@ -176,8 +176,8 @@ class ServedLight:
 
 
 def cascade_share(volume: Volume, points: Float64) -> Float32:
-    """How much of the light of points (n, 3) [m] is their cascade's and not the next one's: 1 from the second of its voxels' centres on
-    inwards, 0 from the outermost. (n,)"""
+    """How much of the light of points (n, 3) [m] is their cascade's and not the next one's: 1 from two voxels inside its
+    outermost centres on, 0 at those. (n,)"""
     place = (points - volume.origin) / volume.voxel_size
     inside = np.minimum(place, EXTENT_M / VOXEL_SIZE_M - place).min(axis=1)
     return np.asarray(np.clip(inside / 2, 0, 1), np.float32)

@@ -64,7 +64,7 @@ def picture(service: Service, query: PreviewQuery, light: Lighting) -> bytes:
     with service.preview_turn():
         if query.view != "lit":
             scene = service.preview_scenes.around(camera.eye, camera.look)
-            residency = service.live.residency()
+            residency = service.live.residency() if query.view == "residency" else {}
             return tonemap.png_file(preview_views.draw(query.view, service.engine, scene, camera, light, residency))
         if query.gi == "error":
             return tonemap.png_file(error_picture(service, camera, light, look))
