@@ -34,44 +34,36 @@ WeatherAt = Callable[[datetime], Weather]
 class LightTrack:
     """The light at the moments that a clock shows, in any order. One thread asks; ``worker`` makes what it will ask for next."""
 
-    def __init__(self, location: Location, worker: Executor, sky: UserSky | None = None) -> None:
+    def __init__(self, location: Location, worker: Executor, weather_at: WeatherAt, sky: UserSky | None = None) -> None:
         """``sky`` takes the place of the model's."""
         self._location = location
         self._sky = sky
         self._worker = worker
-        self._weather_at: WeatherAt | None = None
+        self._weather_at = weather_at
         self._step_s = SHORTEST_STEP_S
         self._made: dict[int, Future[Lighting]] = {}
-        self._standing: tuple[datetime, Lighting] | None = None
+        self._standing: tuple[datetime, Future[Lighting]] | None = None
         self._blended: dict[tuple[int, int], Lighting] = {}
         """By step and part of it: of the moments that were asked for last."""
 
-    def set_weather(self, weather_at: WeatherAt) -> None:
-        """The weather from now on, a function of the moment; the next ``at`` shows it."""
-        self._weather_at = weather_at
-        self._made.clear()
-        self._blended.clear()
-        self._standing = None
+    def is_ready(self, moment: datetime, rate: float) -> bool:
+        """Whether ``at`` would not wait for the same; has made what it lacks."""
+        if rate == 0:
+            return self._have_standing(moment).done()
+        here = math.floor(self._steps(moment, rate))
+        self._have_made(here, here + 1)
+        return self._made[here].done() and self._made[here + 1].done()
 
     def at(self, moment: datetime, rate: float) -> Lighting:
         """The light at an aware moment while the clock runs at ``rate`` x real time (0: it stands).
 
-        Waits only for what could not be foreseen: a first moment, a jump, another weather. Raises UnknownTimeError beyond the supported
+        Waits only for what could not be foreseen: a first moment, a jump, another rate. Raises UnknownTimeError beyond the supported
         years, once the clock stands there.
         """
-        assert self._weather_at is not None
         if rate == 0:
-            utc = moment.astimezone(UTC)  # equal only to the same moment, also in the hour that clocks repeat
-            if self._standing is None or self._standing[0] != utc:
-                self._standing = utc, self._lighting(moment, self._weather_at)
-            return self._standing[1]
+            return self._have_standing(moment).result()
         self._standing = None
-        step_s = max(SHORTEST_STEP_S, 2.0 ** math.ceil(math.log2(max(rate * STEP_REAL_S, 1.0))))
-        if step_s != self._step_s:
-            self._step_s = step_s
-            self._made.clear()
-            self._blended.clear()
-        steps = (moment - _EPOCH).total_seconds() / step_s
+        steps = self._steps(moment, rate)
         here = math.floor(steps)
         self._have_made(here, here + 1)
         # The one before stays for who looks ahead over its end, and then asks for now.
@@ -81,7 +73,7 @@ class LightTrack:
         found = self._blended.get((here, part))
         if found is None:
             first, second = self._made[here].result(), self._made[here + 1].result()
-            begin = _EPOCH + timedelta(seconds=(here + part / BLENDS_PER_STEP) * step_s)
+            begin = _EPOCH + timedelta(seconds=(here + part / BLENDS_PER_STEP) * self._step_s)
             time = begin.astimezone(moment.tzinfo).isoformat()
             found = self._blended[here, part] = between_lightings(first, second, part / BLENDS_PER_STEP, time)
             while len(self._blended) > KEPT_BLENDS:
@@ -90,18 +82,32 @@ class LightTrack:
         self._have_made(here + 2)
         return found
 
+    def _steps(self, moment: datetime, rate: float) -> float:
+        """How many steps a moment is after the epoch, in steps that suit the rate: all are others when it asks for longer ones."""
+        step_s = max(SHORTEST_STEP_S, 2.0 ** math.ceil(math.log2(max(rate * STEP_REAL_S, 1.0))))
+        if step_s != self._step_s:
+            self._step_s = step_s
+            self._made.clear()
+            self._blended.clear()
+        return (moment - _EPOCH).total_seconds() / step_s
+
+    def _have_standing(self, moment: datetime) -> Future[Lighting]:
+        utc = moment.astimezone(UTC)  # equal only to the same moment, also in the hour that clocks repeat
+        if self._standing is None or self._standing[0] != utc:
+            self._standing = utc, self._worker.submit(self._lighting, moment)
+        return self._standing[1]
+
     def _have_made(self, *numbers: int) -> None:
-        assert self._weather_at is not None
         for number in numbers:
             if number not in self._made:
-                self._made[number] = self._worker.submit(self._make, number, self._step_s, self._weather_at)
+                self._made[number] = self._worker.submit(self._make, number, self._step_s)
 
-    def _make(self, number: int, step_s: float, weather_at: WeatherAt) -> Lighting:
+    def _make(self, number: int, step_s: float) -> Lighting:
         moment = _EPOCH + timedelta(seconds=number * step_s)
         # A clock that runs at 60 x makes two a second: kept, they would push out what queries ask for again and again.
-        return self._lighting(moment, weather_at, keep=False)
+        return self._lighting(moment, keep=False)
 
-    def _lighting(self, moment: datetime, weather_at: WeatherAt, keep: bool = True) -> Lighting:
-        lighting = make_lighting(self._location, moment, weather_at(moment), keep)
+    def _lighting(self, moment: datetime, keep: bool = True) -> Lighting:
+        lighting = make_lighting(self._location, moment, self._weather_at(moment), keep)
         with_sky = lighting_with_sky if keep else lighting_with_sky.__wrapped__
         return lighting if self._sky is None else with_sky(lighting, self._sky)

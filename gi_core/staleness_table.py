@@ -100,8 +100,7 @@ def _row(moves: str, engine: Engine, position: Float64, start: str, rate: float,
     begin, clear = parse_time(start, dataset.world.location), parse_weather("clear")
     world = LiveWorld(dataset, shadow_map=False, places=max(places, 2))
     with ThreadPoolExecutor(1) as worker:
-        track = LightTrack(dataset.world.location, worker)
-        track.set_weather(lambda _: clear)
+        track = LightTrack(dataset.world.location, worker, lambda _: clear)
         try:
             return _measured(moves, engine, world, track, position, begin, rate, lamps_at, places)
         finally:

@@ -6,13 +6,12 @@ wait WRITES_WAIT_S before they too are told to come back.
 
 import asyncio
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Annotated, Any, Protocol
 
 from fastapi import Depends
 
 from server.dependencies import ServiceDep
-from server.live_state import Command, LiveState, LiveUnavailableError
+from server.live_state import Applied, Command, LiveState, LiveUnavailableError
 from server.service import Service
 from server.ticker import Ticker
 
@@ -55,24 +54,9 @@ class Kept(Protocol):
     def kept(self) -> bool: ...
 
 
-@dataclass(frozen=True)
-class Applied:
-    """What a command did: the tick from which it holds, and the state right after it."""
-
-    tick: int
-    state: LiveState
-
-
 async def apply(ticker: Ticker, command: Command) -> Applied:
-    """Have a command applied before the next tick. Raises what the command raises."""
-    after: list[LiveState] = []
-
-    def noting(state: LiveState, tick: int) -> LiveState:
-        after.append(command(state, tick))
-        return after[0]
-
-    tick = await asyncio.wrap_future(ticker.apply(noting))
-    return Applied(tick, after[0])
+    """Have a command applied between two ticks. Raises what the command raises."""
+    return await asyncio.wrap_future(ticker.apply(command))
 
 
 async def keep(service: Service, is_concerned: bool) -> None:

@@ -160,6 +160,16 @@ class LiveState:
 
 # From the state before a tick, and its number, to the state in that tick.
 Command = Callable[[LiveState, int], LiveState]
+
+
+@dataclass(frozen=True)
+class Applied:
+    """What a command did: the tick from which it holds, and the state in it."""
+
+    tick: int
+    state: LiveState
+
+
 Thing = TypeVar("Thing")
 Changeable = TypeVar("Changeable", LiveLamp, LiveBox)
 

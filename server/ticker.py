@@ -15,7 +15,8 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from datetime import datetime
 
 import numpy as np
 
@@ -30,8 +31,9 @@ from gi_core.relight_input import relight_input
 from gi_core.settings import Settings
 from gi_core.user_sky import UserSky
 from gi_core.world import Lamp
-from server.live_state import Command, LivePlayer, LiveState, LiveUnavailableError
+from server.live_state import Applied, Command, LivePlayer, LiveState, LiveUnavailableError
 from server.tick_stats import TickStats
+from server.world_clock import WorldClock
 
 log = logging.getLogger("sectorlight.ticker")
 
@@ -42,6 +44,15 @@ FILL_UNTIL = 0.3
 SHORT_TICK_MS, LOOK_AHEAD_TICKS = 1.5, 5
 
 Listener = Callable[[TickReport], None]
+
+
+@dataclass(frozen=True, eq=False)
+class _Coming:
+    """A state that is applied as soon as its light has been made: its track, None where that is the present one."""
+
+    state: LiveState
+    done: Future[Applied]
+    track: LightTrack | None
 
 
 class Ticker:
@@ -57,12 +68,13 @@ class Ticker:
         self.failure: str | None = None
         """Why the world stands still, should it ever."""
         self.listeners: list[Listener] = []
-        self._commands: queue.SimpleQueue[tuple[Command, Future[int]]] = queue.SimpleQueue()
+        self._commands: queue.SimpleQueue[tuple[Command, Future[Applied]]] = queue.SimpleQueue()
         self._stop = threading.Event()
         self._now = time.perf_counter
         self._worker: Executor = ThreadPoolExecutor(1, thread_name_prefix="lighting")
-        self._track = LightTrack(world.dataset.world.location, self._worker, sky)
-        self._track.set_weather(state.weather.at)
+        self._sky = sky
+        self._track = self._track_of(state)
+        self._coming: _Coming | None = None
         self._lighting: Lighting | None = None
         self._lights: deque[tuple[tuple[object, ...], LiveLight]] = deque(maxlen=KEPT_BLENDS)
         """Those that were made last, of this tick or a later one, each behind what it was made of."""
@@ -99,13 +111,16 @@ class Ticker:
         self._stop.set()
         if self._thread.is_alive():
             self._thread.join()
+        if self._coming is not None:
+            self._coming.done.set_exception(self._stopped())
         self._refuse_commands()
         self._worker.shutdown(cancel_futures=True)
         self.world.close()
 
-    def apply(self, command: Command) -> "Future[int]":
-        """Have a command applied before the next tick; the future gives that tick's number, or raises what the command raised."""
-        done: Future[int] = Future()
+    def apply(self, command: Command) -> Future[Applied]:
+        """Have a command applied before the next tick, or where it asks for another weather or time, the one that has light for it; none
+        overtakes another. The future tells of that tick, or raises what the command raised."""
+        done: Future[Applied] = Future()
         self._commands.put((command, done))
         if self._stop.is_set():
             self._refuse_commands()
@@ -183,24 +198,44 @@ class Ticker:
 
     def _apply_commands(self, number: int) -> None:
         while True:
+            if self._coming is None:
+                self._coming = self._next_command(number)
+            coming = self._coming
+            if coming is None or not (coming.track is None or coming.track.is_ready(*shown_by(coming.state.clock, number))):
+                return
+            self._coming = None
+            after = coming.state
+            if coming.track is not None:
+                self._track = coming.track
+                if is_elsewhere(after.clock, self.state.clock, number):  # at the time it asked for when it is seen to
+                    after = replace(after, clock=replace(after.clock, start_tick=number))
+            self._note_changes(self.state, after)
+            self.state = after
+            coming.done.set_result(Applied(number, after))
+
+    def _next_command(self, number: int) -> _Coming | None:
+        """What the next command that can be carried out makes of the state; None when there is none."""
+        while True:
             try:
                 command, done = self._commands.get_nowait()
             except queue.Empty:
-                return
+                return None
             if not done.set_running_or_notify_cancel():
                 continue  # whoever asked has gone, and a future that was cancelled takes no answer
             before = self.state
             try:
-                self.state = command(before, number)
+                after = command(before, number)
+                # A new haze takes as long as ten ticks.
+                is_unforeseen = after.weather is not before.weather or is_elsewhere(after.clock, before.clock, number)
             except Exception as error:
                 done.set_exception(error)
                 continue
-            self._note_changes(before, self.state)
-            done.set_result(number)
+            return _Coming(after, done, self._track_of(after) if is_unforeseen else None)
+
+    def _track_of(self, state: LiveState) -> LightTrack:
+        return LightTrack(self.world.dataset.world.location, self._worker, state.weather.at, self._sky)
 
     def _note_changes(self, before: LiveState, after: LiveState) -> None:
-        if after.weather is not before.weather:
-            self._track.set_weather(after.weather.at)
         if after.lamps is not before.lamps:
             # By identity first: one lamp moves, and thousands do not.
             pairs = [(before.lamps.get(name), after.lamps.get(name)) for name in before.lamps.keys() | after.lamps.keys()]
@@ -211,10 +246,8 @@ class Ticker:
         clock = self.state.clock
         last = clock.last_tick
         if last is not None and number > last:  # the end of the years that have a sun
-            clock = clock.with_paused(last, True)
-            self.state = replace(self.state, clock=clock)
-        rate = 0.0 if clock.paused else clock.rate
-        return self._track.at(clock.moment_at(number), rate)
+            self.state = replace(self.state, clock=clock.with_paused(last, True))
+        return self._track.at(*shown_by(self.state.clock, number))
 
     def _light_at(self, number: int) -> LiveLight:
         try:
@@ -262,7 +295,17 @@ class Ticker:
                 return
             if not done.set_running_or_notify_cancel():
                 continue
-            done.set_exception(LiveUnavailableError(f"the live world has stopped{': ' + self.failure if self.failure else ''}"))
+            done.set_exception(self._stopped())
+
+    def _stopped(self) -> LiveUnavailableError:
+        return LiveUnavailableError(f"the live world has stopped{': ' + self.failure if self.failure else ''}")
+
+
+def shown_by(clock: WorldClock, number: int) -> tuple[datetime, float]:
+    """The moment that a clock shows at a tick, and its rate, 0 where it stands."""
+    last = clock.last_tick
+    stands = clock.paused or (last is not None and number > last)
+    return clock.moment_at(number if last is None else min(number, last)), 0.0 if stands else clock.rate
 
 
 def lamps_now(
@@ -275,6 +318,11 @@ def lamps_now(
         return was if found == was else found
 
     return group(False, before[0]), group(True, before[1])
+
+
+def is_elsewhere(clock: WorldClock, other: WorldClock, number: int) -> bool:
+    """Whether two clocks show different moments at a tick."""
+    return shown_by(clock, number)[0] != shown_by(other, number)[0]
 
 
 def players_at(players: Mapping[str, LivePlayer], number: int, rate_hz: int) -> TickPlayers:

@@ -140,8 +140,7 @@ def test_the_hour_that_clocks_repeat_is_two_hours() -> None:
 def test_a_standing_clock_can_jump_from_one_of_the_repeated_hours_to_the_other() -> None:
     first = parse_time("2024-11-03T01:30-04:00", Location())
     with ThreadPoolExecutor(1) as worker:
-        track = LightTrack(Location(), worker)
-        track.set_weather(lambda _: parse_weather("clear"))
+        track = LightTrack(Location(), worker, lambda _: parse_weather("clear"))
         assert [track.at(moment, 0).time[-6:] for moment in (first, first.replace(fold=1))] == ["-04:00", "-05:00"]
 
 
@@ -151,8 +150,7 @@ def test_a_clock_that_runs_leaves_what_queries_asked_for_in_memory() -> None:
     asked = make_lighting(Location(), start + timedelta(hours=1))
     kept = _make_lighting.cache_info().currsize
     with ThreadPoolExecutor(1) as worker:
-        track = LightTrack(Location(), worker)
-        track.set_weather(lambda _: parse_weather("clear"))
+        track = LightTrack(Location(), worker, lambda _: parse_weather("clear"))
         for second in range(3):
             track.at(start + timedelta(minutes=second), 60.0)
     assert _make_lighting.cache_info().currsize == kept

@@ -1,16 +1,23 @@
 """Commands between ticks: in order, whole or not at all, and nobody else's are lost with one that fails or is given up."""
 
+import threading
+import time
 from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import replace
+from datetime import datetime
 from types import MappingProxyType, SimpleNamespace
 
 import pytest
 
 from gi_core.errors import InputError
+from gi_core.light_track import LightTrack
+from gi_core.lighting import Lighting
 from gi_core.shadow_plan import MovingBox
 from gi_core.world import Lamp, Location
 from server.live_state import (
     MAX_BOXES,
+    Applied,
     LiveBox,
     LiveLamp,
     LiveState,
@@ -20,8 +27,8 @@ from server.live_state import (
     authored_lamps,
 )
 from server.live_weather import fixed_weather
-from server.ticker import Ticker
-from server.world_clock import starting_clock
+from server.ticker import Ticker, shown_by
+from server.world_clock import changed_clock, starting_clock
 
 
 class World:
@@ -57,7 +64,7 @@ def test_commands_apply_in_order_and_name_their_tick(ticker: Ticker) -> None:
     done = [ticker.apply(jumping(n)) for n in (1, 2, 3)]
     ticker._apply_commands(7)
     assert ticker.state.jumps == 123
-    assert [future.result(0) for future in done] == [7, 7, 7]
+    assert [future.result(0).tick for future in done] == [7, 7, 7]
 
 
 def test_one_that_fails_changes_nothing_and_stops_no_other(ticker: Ticker) -> None:
@@ -67,7 +74,7 @@ def test_one_that_fails_changes_nothing_and_stops_no_other(ticker: Ticker) -> No
     ticker._apply_commands(0)
     with pytest.raises(NoSuchThingError):
         missing.result(0)
-    assert after.result(0) == 0
+    assert after.result(0).tick == 0
     assert ticker.state.lamps is before.lamps
 
 
@@ -77,7 +84,7 @@ def test_one_that_was_given_up_is_left_out(ticker: Ticker) -> None:
     assert given_up.cancel()
     ticker._apply_commands(0)
     assert ticker.state.jumps == 2
-    assert after.result(0) == 0
+    assert after.result(0).tick == 0
 
 
 def test_a_ticker_that_stops_refuses_what_is_left(ticker: Ticker) -> None:
@@ -88,6 +95,66 @@ def test_a_ticker_that_stops_refuses_what_is_left(ticker: Ticker) -> None:
     for future in (waiting, late):
         with pytest.raises(LiveUnavailableError):
             future.result(0)
+
+
+def test_another_weather_waits_for_its_light_and_none_overtakes_it(ticker: Ticker, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A new haze takes as long as ten ticks to make: those ticks go on in the old one."""
+    ticker._lighting_at(0)
+    may_be_made = threading.Event()
+    made = LightTrack._lighting
+
+    def slow(track: LightTrack, moment: datetime, keep: bool = True) -> Lighting:
+        assert may_be_made.wait(10)
+        return made(track, moment, keep)
+
+    monkeypatch.setattr(LightTrack, "_lighting", slow)
+    rain = fixed_weather("rain")
+    weather = ticker.apply(lambda state, _: state.with_weather(rain, is_jump=True))
+    after = ticker.apply(jumping(1))
+    for number in (1, 2):
+        ticker._apply_commands(number)
+        assert ticker._lighting_at(number).weather == "clear"
+        assert not weather.done()
+        assert not after.done()
+        assert ticker.state.weather is not rain
+    may_be_made.set()
+    number = ticks_until(ticker, weather, 3)
+    assert weather.result(0).tick == after.result(0).tick == number
+    assert weather.result(0).state.weather is rain
+    assert ticker.state.jumps == 11
+    assert ticker._track.is_ready(*shown_by(ticker.state.clock, number))
+    assert ticker._lighting_at(number).weather == "rain"
+
+
+def test_a_clock_that_is_set_shows_that_time_when_its_light_is_there(ticker: Ticker) -> None:
+    def noon(state: LiveState, tick: int) -> LiveState:
+        return state.with_clock(changed_clock(state.clock, tick, {"time": "13:00", "rate": 60}, Location()), is_jump=True)
+
+    done = ticker.apply(noon)
+    number = ticks_until(ticker, done, 5)
+    applied = done.result(0)
+    assert number > 5, "its light cannot have been there"
+    assert applied.tick == number
+    assert applied.state.clock.moment_at(number).strftime("%H:%M:%S.%f") == "13:00:00.000000"
+    assert applied.state.clock.moment_at(number + 30).strftime("%H:%M:%S") == "13:01:00"
+
+
+def test_a_ticker_that_stops_refuses_what_waits_for_light(ticker: Ticker) -> None:
+    waiting = ticker.apply(lambda state, _: state.with_weather(fixed_weather("rain"), is_jump=True))
+    ticker._apply_commands(0)
+    ticker.stop()
+    with pytest.raises(LiveUnavailableError):
+        waiting.result(0)
+
+
+def ticks_until(ticker: Ticker, done: Future[Applied], first: int) -> int:
+    """The number of the tick, from ``first`` on, that carries a command out."""
+    for number in range(first, first + 1000):
+        ticker._apply_commands(number)
+        if done.done():
+            return number
+        time.sleep(0.01)
+    raise AssertionError("none did")
 
 
 def test_only_lamps_that_changed_are_said_to_have(ticker: Ticker) -> None:
