@@ -2,8 +2,8 @@
 
 import itertools
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from threading import Lock
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from gi_core.constants import VOLUME_SHAPE
 from gi_core.device import Device
 from gi_core.geometry_file import Geometry
 from gi_core.grid import SectorIndex, voxel_columns
-from gi_core.light_geometry import ShadowGeometry
+from gi_core.light_geometry import ShadowGeometry, SharedGeometry
 from gi_core.live_sector import LiveSector
 from gi_core.live_volume import LiveVolume, PublishedVolume
 from gi_core.resident_sector import ResidentSector
@@ -53,9 +53,9 @@ def bench_step(device: Device, rounds: int = 100) -> Measurement:
     Baseline: the same volume moving by one voxel along y, where nothing stays in its place: filled whole, read likewise.
     """
     without_lamps: dict[SectorIndex, Geometry] = {}
-    shadows = ShadowGeometry(without_lamps.__getitem__, ())
+    shadows = SharedGeometry(ShadowGeometry(without_lamps.__getitem__, ()), ThreadPoolExecutor(1))
     indices = [SectorIndex(x, z) for x in (0, 1) for z in (0, 1)]
-    residents = {index: LiveSector(device, _sector_at(index), SKY_PATCHES, shadows, Lock()) for index in indices}
+    residents = {index: LiveSector(device, _sector_at(index), SKY_PATCHES, shadows) for index in indices}
     for sector in residents.values():
         sector.resident.write_cubes(_light())
     place = np.array([4, 0, 4])

@@ -2,10 +2,13 @@
 
 from collections import OrderedDict
 from collections.abc import Callable, Collection
+from concurrent.futures import Executor, Future
+from threading import Lock
 
 import numpy as np
 
 from gi_core.arrays import Float64
+from gi_core.background import give_way
 from gi_core.constants import SECTOR_SIZE_M
 from gi_core.device import Device
 from gi_core.geometry_file import Geometry
@@ -15,6 +18,14 @@ from gi_core.shadow_tree import ShadowTree, build_tree
 
 # Trees that are kept for the next lamp, 70 to 110 bytes a triangle: a borough of New York.
 KEPT_BYTES = 1 << 28
+
+
+class UnreadGeometryError(LookupError):
+    """Triangles that were not to be read: of which sectors."""
+
+    def __init__(self, sectors: frozenset[SectorIndex]) -> None:
+        super().__init__(f"the triangles of {len(sectors)} sectors have not been read")
+        self.sectors = sectors
 
 
 class ShadowGeometry:
@@ -30,6 +41,14 @@ class ShadowGeometry:
         self._kept_bytes = kept_bytes
         self._kept: OrderedDict[SectorIndex, ShadowTree] = OrderedDict()
         self._tiles: dict[Device, ShadowTiles] = {}
+
+    def read(self, sectors: Collection[SectorIndex], may_read: bool = True) -> None:
+        """Have the trees of sectors. Raises UnreadGeometryError where one would have to be read and none ``may_read``, else as ``tree``."""
+        unread = frozenset(index for index in sectors if index not in self._kept)
+        if unread and not may_read:
+            raise UnreadGeometryError(unread)
+        for index in unread:
+            self.tree(index)
 
     def sectors_in(self, low: Float64, high: Float64) -> list[SectorIndex]:
         """Sectors with triangles whose columns meet the box from low (3,) to high (3,) [m], world frame, ascending."""
@@ -64,3 +83,23 @@ class ShadowGeometry:
         if device not in self._tiles:
             self._tiles[device] = ShadowTiles(device, self.tree, self._kept_bytes)
         return self._tiles[device]
+
+
+class SharedGeometry:
+    """One ``ShadowGeometry`` for ticks and for the threads that load sectors; ``tracing`` is held by the one that uses it."""
+
+    def __init__(self, geometry: ShadowGeometry, reader: Executor) -> None:
+        """``reader`` reads what ticks come to need, in a thread that gives way to them."""
+        self.geometry = geometry
+        self.tracing = Lock()
+        self._reader = reader
+
+    def read_soon(self, sectors: Collection[SectorIndex]) -> Future[None]:
+        """Have the trees of sectors read by the thread for that."""
+        return self._reader.submit(self._read, sorted(sectors))
+
+    def _read(self, sectors: list[SectorIndex]) -> None:
+        for index in sectors:
+            give_way()
+            with self.tracing:
+                self.geometry.tree(index)

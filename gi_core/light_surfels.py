@@ -70,14 +70,14 @@ class SurfelLights:
         """The static and the dynamic lamps as they were given last."""
         return self._static.given, self._dynamic.given
 
-    def set_static(self, lamps: Sequence[Lamp]) -> None:
+    def set_static(self, lamps: Sequence[Lamp], may_read: bool = True) -> None:
         """Lamps that seldom change: all of the world that are on, not only those near. Nothing happens when they are the same as before,
         and shadows stay when only lumens and colours have changed.
 
-        Raises InputError for a touching lamp that is out of its ranges, CorruptFileError for geometry that cannot be read; then the
-        light stays as it was.
+        Raises InputError for a touching lamp that is out of its ranges, CorruptFileError for geometry that cannot be read, and
+        UnreadGeometryError for geometry that has not been where none ``may_read``; then the light stays as it was.
         """
-        before, after = self._static, self._changed(self._static, tuple(lamps), self._dynamic)
+        before, after = self._static, self._changed(self._static, tuple(lamps), self._dynamic, may_read)
         self._static = after
         if after.records.tobytes() == before.records.tobytes():
             return
@@ -90,9 +90,9 @@ class SurfelLights:
             self._sum(after, None, self._static_sum, changed)
         self._sum_all(changed)
 
-    def set_dynamic(self, lamps: Sequence[Lamp]) -> None:
+    def set_dynamic(self, lamps: Sequence[Lamp], may_read: bool = True) -> None:
         """Lamps that move or flicker, as ``set_static``."""
-        before, after = self._dynamic, self._changed(self._dynamic, tuple(lamps), self._static)
+        before, after = self._dynamic, self._changed(self._dynamic, tuple(lamps), self._static, may_read)
         self._dynamic = after
         if after.records.tobytes() != before.records.tobytes():
             self._sum_all(changed_spheres(before.given, after.given, self._sector.index.origin))
@@ -109,7 +109,7 @@ class SurfelLights:
     def _allocate(self) -> cl.Buffer:
         return self._device.allocate(16 * self._sector.surfel_count)
 
-    def _changed(self, before: _Lit, given: tuple[Lamp, ...], others: _Lit) -> _Lit:
+    def _changed(self, before: _Lit, given: tuple[Lamp, ...], others: _Lit, may_read: bool) -> _Lit:
         """Lamps with their shadows, traced for those that stand as none did before. Raises before anything has changed."""
         if given == before.given:
             return before
@@ -121,7 +121,7 @@ class SurfelLights:
             if shadows[i] is not None:
                 check_lamp(given[i])
         unknown = [i for i in arrived if shadows[i] is None]
-        touching = self._touching([given[i] for i in unknown])
+        touching = self._touching([given[i] for i in unknown], may_read)
 
         self._bits.keep({*others.shadows, *shadows})
         untraced: dict[int, list[SectorIndex]] = {}
@@ -137,14 +137,13 @@ class SurfelLights:
         self._trace(records[[i in untraced for i in planes]], list(untraced.values()))
         return _Lit(given, tuple(shadows), _in_order(before, was, shadows, records))
 
-    def _touching(self, lamps: Sequence[Lamp]) -> dict[int, list[SectorIndex]]:
+    def _touching(self, lamps: Sequence[Lamp], may_read: bool) -> dict[int, list[SectorIndex]]:
         """Which of the lamps touch, and for each the sectors whose triangles may shadow it. Those have been read when this returns."""
         if not lamps:
             return {}
         self._bounds = self._bounds or SurfelBounds(self._sector)
         touching = {found.index: self._geometry.sectors_in(found.low, found.high) for found in touching_lamps(lamps, self._bounds)}
-        for index in {index for about in touching.values() for index in about}:
-            self._geometry.tree(index)
+        self._geometry.read({index for about in touching.values() for index in about}, may_read)
         return touching
 
     def _trace(self, records: AnyArray, about: Sequence[list[SectorIndex]]) -> None:

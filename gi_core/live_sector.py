@@ -2,9 +2,9 @@
 
 import math
 from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import cached_property
-from threading import Lock
 
 import numpy as np
 import pyopencl as cl
@@ -14,7 +14,7 @@ from gi_core.background import give_way
 from gi_core.basis import basis_of_size, brightness, from_axes
 from gi_core.device import Device
 from gi_core.light_blend import LightVector
-from gi_core.light_geometry import ShadowGeometry
+from gi_core.light_geometry import SharedGeometry, UnreadGeometryError
 from gi_core.light_surfels import SurfelLights
 from gi_core.lighting import Lighting
 from gi_core.relight import Relighter
@@ -87,12 +87,12 @@ class LiveLight:
 class LiveSector:
     """One sector that is lit tick by tick. Made by a loader's thread, then the ticker's alone."""
 
-    def __init__(self, device: Device, sector: Sector, sky_patches: int, geometry: ShadowGeometry, tracing: Lock) -> None:
-        """``tracing`` is held while lamps' shadows are traced: ``geometry`` is shared, and not for two threads at once."""
+    def __init__(self, device: Device, sector: Sector, sky_patches: int, shared: SharedGeometry) -> None:
+        """``shared`` : what lamps' shadows are traced through."""
         self.resident = ResidentSector(device, sector, sky_patches)
         self.resident.prepare()
         self.resident.release_host_arrays()
-        self.lamps = SurfelLights(device, sector, geometry)
+        self.lamps = SurfelLights(device, sector, shared.geometry)
         self.samples: SunSamples | None = None
         self.sampled_of: ShadowPlan | None = None
         """The plan of the shadow map that its samples are from; None before any."""
@@ -107,7 +107,9 @@ class LiveSector:
         self.shown_at = -1
         """The last tick in which what is shown of it changed."""
         self._device = device
-        self._tracing = tracing
+        self._shared = shared
+        self._reading: Future[None] | None = None
+        """Of triangles that its lamps need, until they have been traced through."""
         self._low, self._high = _bounds(sector)
         self._unshown = 0.0
         """How far its light has moved, at most, since something of it was shown, as a share of its brightest probe."""
@@ -173,21 +175,30 @@ class LiveSector:
             self.resident.set_sun_sample(None)
 
     def set_lamps(self, light: LiveLight, wait: bool) -> bool:
-        """Have the next relight read these lamps; whether it will: without ``wait``, not while another thread traces shadows."""
+        """Have the next relight read these lamps; whether it will: without ``wait``, not while another thread traces shadows, nor before
+        one has read the triangles that cast them."""
         if self.lamps.given == (light.static_lamps, light.dynamic_lamps):
             return True
-        if not self._tracing.acquire(blocking=wait):
+        if not wait and self._reading is not None and not self._reading.done():
             return False
+        if not self._shared.tracing.acquire(blocking=wait):
+            return False
+        before = self.lamps.buffer
         try:
-            before = self.lamps.buffer
-            self.lamps.set_static(light.static_lamps)
-            self.lamps.set_dynamic(light.dynamic_lamps)
+            # What was read and given up again, for want of room, is read here: it would be given up for ever.
+            may_read = wait or self._reading is not None
+            self.lamps.set_static(light.static_lamps, may_read)
+            self.lamps.set_dynamic(light.dynamic_lamps, may_read)
+            self._reading = None
+        except UnreadGeometryError as error:
+            self._reading = self._shared.read_soon(error.sectors)
+            return False
+        finally:
             # The geometry on the device is shared with threads that have another queue.
             self._device.queue.finish()
-        finally:
-            self._tracing.release()
-        if before is not None or self.lamps.buffer is not None:
-            self.resident.set_lamps(self.lamps.buffer)
+            self._shared.tracing.release()
+            if before is not None or self.lamps.buffer is not None:
+                self.resident.set_lamps(self.lamps.buffer)
         return True
 
     def reaches(self, position: Float64, range_m: float) -> bool:

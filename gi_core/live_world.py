@@ -11,11 +11,10 @@ A tick, in order:
     shadow map   draw some more of the next one; sectors take samples of one that was just drawn
 
 Lighting belongs to the world: players share lit sectors, only volumes are theirs. One thread calls ``tick``; what it publishes is
-anybody's. No kernel is compiled in it, once ``warm_up`` has run, and no file read but of triangles that a lamp is the first to ask for.
+anybody's. No kernel is compiled in it, once ``warm_up`` has run, and no file read.
 """
 
 import logging
-import threading
 import time
 from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import Executor
@@ -37,7 +36,7 @@ from gi_core.errors import SectorlightError
 from gi_core.geometry_file import Geometry
 from gi_core.grid import SectorIndex, volume_first_voxel
 from gi_core.layout import DIRECTIONAL_LIGHT, MAX_DIRECTIONAL_LIGHTS
-from gi_core.light_geometry import ShadowGeometry
+from gi_core.light_geometry import ShadowGeometry, SharedGeometry
 from gi_core.light_needs import WHOLLY, LightNeeds
 from gi_core.light_surfels import SurfelLights
 from gi_core.live_sector import AHEAD_TIMES, BURST_CHANGE, BURST_PASSES, HURRIED_TIMES, LiveLight, LiveSector
@@ -130,9 +129,10 @@ class LiveWorld:
         self._places = places
         conversion(dataset.world.basis, basis)
         self.basis = basis
-        self._geometry = ShadowGeometry(self._read_geometry, dataset.world.sectors)
-        self._tracing = threading.Lock()
         self._right_of_way = RightOfWay()
+        # Its thread begins when a tick first needs something read.
+        self._geometry_reader = self.background_thread("geometry-reader")
+        self._shared = SharedGeometry(ShadowGeometry(self._read_geometry, dataset.world.sectors), self._geometry_reader)
         options = stream or StreamOptions(budget_bytes)
         self.streamer = Streamer(sector_table(dataset.world), dataset.sector, self._place, options, self._right_of_way)
         self.streamer.lamps_planned = bool(dataset.world.lamps)
@@ -234,6 +234,7 @@ class LiveWorld:
     def close(self) -> None:
         """Stop the threads that read."""
         self.streamer.close()
+        self._geometry_reader.shutdown(cancel_futures=True)
         if self._shadows is not None:
             self._shadows.close()
 
@@ -267,7 +268,7 @@ class LiveWorld:
             return NO_TRIANGLES
 
     def _new_sector(self, sector: Sector) -> LiveSector:
-        return LiveSector(self._device, sector, self.dataset.world.sky_patches, self._geometry, self._tracing)
+        return LiveSector(self._device, sector, self.dataset.world.sky_patches, self._shared)
 
     def _welcome(self, index: SectorIndex, tick: int, light: LiveLight) -> None:
         """Note how far a sector that has just arrived is from the light it should have."""

@@ -1,9 +1,12 @@
 """The live world settles to what a query gives, follows what changes, and forgets what was."""
 
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from datetime import datetime
 from itertools import count
-from threading import Lock
 
 import numpy as np
 import pytest
@@ -14,9 +17,10 @@ from gi_core.dataset import Dataset
 from gi_core.device import shared_device
 from gi_core.engine import Engine
 from gi_core.errors import InputError
+from gi_core.geometry_file import Geometry
 from gi_core.grid import SectorIndex
 from gi_core.light_blend import LightVector
-from gi_core.light_geometry import ShadowGeometry
+from gi_core.light_geometry import ShadowGeometry, SharedGeometry
 from gi_core.live_sector import FADE_TICKS, LiveLight, LiveSector, fade_ticks
 from gi_core.live_world import LiveWorld, TickReport
 from gi_core.relight import Relighter
@@ -189,7 +193,7 @@ def test_a_sector_of_any_size_is_lit_shown_and_dark_again(make_sector, engine, s
     """Under the sun of noon, its shadow map's samples, and a lamp; then without any of it."""
     device, table = shared_device(), engine.dataset.world.sun_table
     sector = make_sector(3, planes=table.plane_count, **size)
-    live = LiveSector(device, sector, 6, ShadowGeometry({}.__getitem__, []), Lock())
+    live = LiveSector(device, sector, 6, SharedGeometry(ShadowGeometry({}.__getitem__, []), ThreadPoolExecutor(1)))
     noon = engine.lighting("12:00", "snow")
     dark = replace(
         noon,
@@ -215,6 +219,47 @@ def test_a_sector_of_any_size_is_lit_shown_and_dark_again(make_sector, engine, s
         assert np.isfinite(shown).all()
         assert shown.any() == (lighting is noon and sector.probe_count > 0)
         assert not live.is_fading
+
+
+def test_ticks_read_no_triangles_for_a_lamp(make_sector, engine):
+    """A tick goes on without the lamp until another thread has read them, however long that takes; then it is lit as ever."""
+    sector = make_sector(3)
+    readers, may_read = set(), threading.Event()
+    roof = Geometry(
+        np.array([[0, 60, 0], [64, 60, 0], [0, 60, 64.0]]), np.array([[0, 1, 2]], np.int32), *2 * (np.ones((1, 3), np.float32),)
+    )
+
+    def read(_: SectorIndex) -> Geometry:
+        assert may_read.wait(10)
+        readers.add(threading.current_thread().name)
+        return roof
+
+    def live_sector(read: Callable[[SectorIndex], Geometry]) -> LiveSector:
+        shared = SharedGeometry(ShadowGeometry(read, [sector.index]), ThreadPoolExecutor(1, thread_name_prefix="reader"))
+        return LiveSector(shared_device(), sector, 6, shared)
+
+    x, y, z = (sector.index.origin + 32.0).tolist()
+    lamp = Lamp("lamp", "point", (x, y + 70.0, z), 1e9, range_m=1e4)
+    lighting = engine.lighting("12:00", "clear")
+    given = relight_input(lighting, engine.dataset.world.sun_table)
+    light = LiveLight(lighting, given, LightVector.of(given), (lamp,), (), NEUTRAL, False)
+    live = live_sector(read)
+    for _ in range(3):
+        assert not live.set_lamps(light, wait=False)
+        assert live.lamps.given == ((), ())
+    may_read.set()
+    give_up_at = time.monotonic() + 10
+    while not live.set_lamps(light, wait=False):
+        assert time.monotonic() < give_up_at
+        time.sleep(0.01)
+    assert readers == {"reader_0"}
+    at_once = live_sector(lambda _: roof)
+    assert at_once.set_lamps(light, wait=True)
+    lit = [np.zeros((sector.surfel_count, 4), np.float32) for _ in range(2)]
+    for found, one in zip(lit, (live, at_once), strict=True):
+        shared_device().read(one.lamps.buffer, found)
+    assert lit[0].any()
+    np.testing.assert_array_equal(*lit)
 
 
 def test_light_on_and_off_again_gives_the_first_bytes_back(world, engine):

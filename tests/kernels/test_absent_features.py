@@ -1,7 +1,7 @@
 """What a scene does not have has no buffer on the device, and no kernel is built for it."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from threading import Lock
 
 import numpy as np
 import pyopencl as cl
@@ -10,7 +10,7 @@ import pytest
 from gi_core.bench_relight import made_up_city
 from gi_core.device import Device
 from gi_core.layout import DIRECTIONAL_LIGHT
-from gi_core.light_geometry import ShadowGeometry
+from gi_core.light_geometry import ShadowGeometry, SharedGeometry
 from gi_core.live_sector import LiveSector
 from gi_core.relight import Relighter
 from gi_core.relight_input import RelightInput
@@ -102,7 +102,9 @@ def test_lamps_and_samples_are_the_code_that_they_ask_for_and_their_makers_bytes
 
 def test_a_live_sector_counts_each_buffer_once(fresh, make_sector):
     sector = plain(make_sector)
-    live = LiveSector(fresh, sector, PATCHES, ShadowGeometry(lambda _: made_up_city(), {sector.index}), Lock())
+    live = LiveSector(
+        fresh, sector, PATCHES, SharedGeometry(ShadowGeometry(lambda _: made_up_city(), {sector.index}), ThreadPoolExecutor(1))
+    )
     x, y, z = (sector.index.origin + sector.surfel_position[0] + sector.surfel_normal[0]).tolist()
     live.lamps.set_static([Lamp("lamp", "point", (x, y, z), 1e3)])
     live.resident.set_lamps(live.lamps.buffer)

@@ -1,7 +1,7 @@
 """The loop of bounces over many ticks: it never grows, never drifts, and forgets what was."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from threading import Lock
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from gi_core import factor_weights
 from gi_core.device import shared_device
 from gi_core.layout import DIRECTIONAL_LIGHT
 from gi_core.light_blend import LightVector
-from gi_core.light_geometry import ShadowGeometry
+from gi_core.light_geometry import ShadowGeometry, SharedGeometry
 from gi_core.lighting_model import make_lighting
 from gi_core.lights import MAX_LUMENS, MAX_RANGE_M
 from gi_core.live_sector import LiveLight, LiveSector
@@ -102,7 +102,7 @@ def test_with_all_gains_and_colours_at_their_maximum_ticks_never_grow(make_secto
     light = LiveLight(lighting, given, LightVector.of(given), lamps[:1], lamps[1:], panel, False)
     device = shared_device()
     relighter = Relighter(device)
-    live = LiveSector(device, sector, PATCHES, ShadowGeometry({}.__getitem__, []), Lock())
+    live = LiveSector(device, sector, PATCHES, SharedGeometry(ShadowGeometry({}.__getitem__, []), ThreadPoolExecutor(1)))
     shown, kept = np.zeros((2, sector.probe_count, 6, 4), np.float32)
     for tick in range(ticks):
         live.light(light, is_read=True)
