@@ -25,7 +25,10 @@ def loadtest(
     ] = 0.0,
     path: Annotated[
         Path | None,
-        typer.Option(help="JSON: a list of points x, y, z in metres, or several such lists; without it players walk the streets."),
+        typer.Option(
+            help="JSON: a list of points x, y, z in metres, several such lists, or GeoJSON LineStrings of x, z, height; without it players"
+            " walk the streets."
+        ),
     ] = None,
     speed: Annotated[float, typer.Option(min=0, max=200, help="Of the players, in m/s.")] = 5.0,
     mode: Annotated[

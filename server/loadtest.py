@@ -30,7 +30,6 @@ JUMP_SHARE = 0.25
 PARALLEL_REQUESTS = 8
 
 Path3 = Sequence[tuple[float, float, float]]
-Progress = Callable[[float, Recorder], None]
 
 
 class LoadTestError(SectorlightError, RuntimeError):
@@ -40,11 +39,25 @@ class LoadTestError(SectorlightError, RuntimeError):
 
 
 @dataclass(frozen=True)
+class Stage:
+    """How far a test is: ``done`` of ``whole``, players made or seconds. recorder : what clients have seen so far, once they are there"""
+
+    name: str
+    done: float
+    whole: float
+    recorder: Recorder | None = None
+
+
+Progress = Callable[[Stage], None]
+
+
+@dataclass(frozen=True)
 class Options:
     """What to run.
 
     url : of the server, without a path
-    paths : world metres; player k walks number k modulo their count; without any the server makes up a walk for each
+    paths : world metres; player k walks number k modulo their count, round and round where it ends at its beginning, else back and
+        forth; without any the server makes up a walk for each
     speed : [m/s]
     warm_up_s : how long players walk before clients follow and anything is counted
     token : bearer token of writes
@@ -79,13 +92,10 @@ async def _run(options: Options, progress: Progress) -> dict[str, Any]:
     async with (
         httpx.AsyncClient(base_url=options.url, headers=headers, timeout=REQUEST_S, limits=limits, trust_env=False) as http,
         _interruptible(stop),
-        _players(http, options, stop) as players,
+        _players(http, options, stop, progress) as players,
     ):
         recorder = Recorder()
-        if options.warm_up_s > 0:
-            progress(0.0, recorder)
-            with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(stop.wait(), options.warm_up_s)
+        await _warm_up(options.warm_up_s, stop, progress)
         started = time.perf_counter()
         watch = Watch(recorder, lambda: time.perf_counter() - started, options.pop_bound)
         await _ask_live(http, watch)
@@ -105,6 +115,14 @@ async def _run(options: Options, progress: Progress) -> dict[str, Any]:
                 raise ended
         setting = Setting(len(players), options.mode, options.speed, options.pop_bound, _is_this_machine(options.url))
         return report_of(recorder, setting, seconds, cpu_share, stop.is_set())
+
+
+async def _warm_up(seconds: float, stop: asyncio.Event, progress: Progress) -> None:
+    started = time.perf_counter()
+    while (passed := time.perf_counter() - started) < seconds and not stop.is_set():
+        progress(Stage("warm-up", passed, seconds))
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(stop.wait(), min(POLL_S, seconds - passed))
 
 
 @contextlib.asynccontextmanager
@@ -128,15 +146,17 @@ async def _interruptible(stop: asyncio.Event) -> AsyncIterator[None]:
 
 
 @contextlib.asynccontextmanager
-async def _players(http: httpx.AsyncClient, options: Options, stop: asyncio.Event) -> AsyncIterator[list[str]]:
+async def _players(http: httpx.AsyncClient, options: Options, stop: asyncio.Event, progress: Progress) -> AsyncIterator[list[str]]:
     """The names of new players of the server, which are deleted in the end; no more of them once ``stop`` is set. Raises InputError or
     LoadTestError."""
     run_name, made, asked, turns = f"loadtest-{token_hex(4)}", [], set(), asyncio.Semaphore(PARALLEL_REQUESTS)
 
     async def make(number: int) -> None:
-        wish: dict[str, Any] = {"id": f"{run_name}-{number}", "speed": options.speed, "loop": True, "seed": options.seed + number}
+        wish: dict[str, Any] = {"id": f"{run_name}-{number}", "speed": options.speed, "seed": options.seed + number}
         if options.paths:
-            wish["path"] = [list(point) for point in options.paths[number % len(options.paths)]]
+            path = options.paths[number % len(options.paths)]
+            # One that ends elsewhere has no way back but its own.
+            wish |= {"path": [list(point) for point in path], "loop": path[0] == path[-1]}
         async with turns:
             if stop.is_set():
                 return
@@ -144,6 +164,7 @@ async def _players(http: httpx.AsyncClient, options: Options, stop: asyncio.Even
             asked.add(wish["id"])
             reply = await _send(http, "POST", "/v1/players", options.url, json=wish)
         made.append(_player_name(reply))
+        progress(Stage("new players", len(made), options.players))
 
     async def delete(name: str) -> None:
         async with turns:
@@ -208,7 +229,7 @@ async def _watch_server(
             await asyncio.wait_for(stop.wait(), min(POLL_S, left))
         await _ask_live(http, watch)
         clock = await _ask_clock(http, watch, clock)
-        progress(watch.now(), watch.recorder)
+        progress(Stage(f"{len(clients)} players", min(watch.now(), seconds), seconds, watch.recorder))
 
 
 async def _ask_live(http: httpx.AsyncClient, watch: Watch) -> None:

@@ -2,7 +2,7 @@
 
 import io
 import json
-import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -16,9 +16,10 @@ from gi_core.container import write_atomic
 from gi_core.errors import InputError
 from gi_core.outputs import expect_file
 from server import loadtest_limits, loadtest_plot
-from server.loadtest import Options, Path3, run
+from server.json_input import read_text
+from server.loadtest import Options, Path3, Stage, run
 from server.loadtest_limits import Limits
-from server.loadtest_record import Recorder
+from server.player_paths import points_from_json
 
 CACHE_COUNTS = ("hits", "misses", "player_volume_hits", "player_volume_misses")
 MAX_PATH_FILE_BYTES = 1 << 26
@@ -38,23 +39,26 @@ def checked_url(text: str) -> str:
     return text.rstrip("/")
 
 
-def read_paths(file: Path) -> list[Path3]:
-    """The paths in a JSON file: one list of [x, y, z] in world metres, or a list of such lists. Raises InputError."""
+def read_paths(file: Path) -> Sequence[Path3]:
+    """The paths in a JSON file: one list of [x, y, z] in world metres, a list of such lists, or GeoJSON's LineStrings, [x, z, height] in
+    metres. Raises InputError."""
+    where = f"--path {file}"
     try:
-        with file.open("rb") as opened:
-            found = json.loads(opened.read(MAX_PATH_FILE_BYTES))
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"--path {file}: expected a readable JSON file, found {error}") from error
-    paths = found if isinstance(found, list) and found and isinstance(found[0], list) and found[0] and _is_point(found[0][0]) else [found]
-    for path in paths:
-        if not isinstance(path, list) or len(path) < 2 or not all(map(_is_point, path)):
-            raise InputError(f"--path {file}: expected a list of at least two points [x, y, z] in metres, or a list of such lists")
-    return [[(float(x), float(y), float(z)) for x, y, z in path] for path in paths]
+        found = json.loads(read_text(file, MAX_PATH_FILE_BYTES))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{where}: expected JSON ({str(error)[:200]})") from error
+    paths = [points_from_json(path, where if path is found else f"{where}: path {i}") for i, path in enumerate(_each(found))]
+    if not paths or min(map(len, paths)) < 2:
+        raise InputError(f"{where}: expected paths of at least two points [x, y, z] in metres")
+    return paths
 
 
-def _is_point(value: Any) -> bool:
-    numbers = isinstance(value, list) and len(value) == 3 and all(isinstance(n, int | float) and not isinstance(n, bool) for n in value)
-    return numbers and all(abs(n) < 1e9 and math.isfinite(n) for n in value)
+def _each(found: Any) -> list[Any]:
+    """What a path file holds, a path each."""
+    if isinstance(found, dict) and found.get("type") == "FeatureCollection" and isinstance(found.get("features"), list):
+        return list(found["features"])
+    is_list_of_paths = isinstance(found, list) and found and isinstance(found[0], list) and found[0] and isinstance(found[0][0], list)
+    return found if is_list_of_paths else [found]
 
 
 def run_command(options: Options, limits: Limits, json_path: Path | None, plot_path: Path | None) -> tuple[list[str], bool]:
@@ -69,12 +73,13 @@ def run_command(options: Options, limits: Limits, json_path: Path | None, plot_p
         TimeRemainingColumn(),
         console=Console(stderr=True),
     )
-    task = bar.add_task(f"{options.players} players", total=options.seconds, seen="")
+    task = bar.add_task("", seen="")
 
-    def show_progress(at: float, recorder: Recorder) -> None:
+    def show_progress(stage: Stage) -> None:
         bar.start()  # not before: a server that isn't there gets one line, without a bar
-        seen = f"{recorder.total('frames'):,} frames, {recorder.total('errors'):,} errors"
-        bar.update(task, completed=min(at, options.seconds), seen=seen)
+        recorder = stage.recorder
+        seen = "" if recorder is None else f"{recorder.total('frames'):,} frames, {recorder.total('errors'):,} errors"
+        bar.update(task, description=stage.name, completed=stage.done, total=stage.whole, seen=seen)
 
     try:
         report = run(options, show_progress)

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from server.loadtest import LoadTestError, Options, run
+from server.loadtest import LoadTestError, Options, Stage, run
 
 StandingIn = Callable[..., AbstractContextManager[tuple[Any, str]]]
 CONTRACT = {"players", "seconds", "tick_ms", "late_ticks", "volume_ms", "bytes_per_second_per_player", "misses", "pops", "errors"}
@@ -21,7 +21,7 @@ COMMAND = [sys.executable, "-c", "from server.cli import main; main()", "loadtes
 
 
 def measure(url: str, **options: Any) -> dict[str, Any]:
-    return run(Options(url, **{"players": 2, "seconds": 1.7, **options}), lambda at, recorder: None)
+    return run(Options(url, **{"players": 2, "seconds": 1.7, **options}), lambda stage: None)
 
 
 @pytest.mark.parametrize("mode", ["stream", "fetch"])
@@ -30,7 +30,7 @@ def test_a_server_that_behaves(standing_in: StandingIn, mode: str) -> None:
         report = measure(url, mode=mode, players=3)
         assert not world.players
         assert len(world.made) == 3
-        assert all(wish["speed"] == 5.0 and wish["loop"] and "path" not in wish for wish in world.made)
+        assert all(wish["speed"] == 5.0 and "path" not in wish for wish in world.made)
         assert sorted(wish["seed"] for wish in world.made) == [0, 1, 2]
     assert set(report) >= CONTRACT
     assert report["players"] == 3
@@ -53,6 +53,19 @@ def test_a_server_that_behaves(standing_in: StandingIn, mode: str) -> None:
         assert report["volume_ms_since"] == "the tick"
     else:
         assert report["frames"] > 3 * 10
+
+
+def test_progress_tells_of_players_warm_up_and_test(standing_in: StandingIn) -> None:
+    stages: list[Stage] = []
+    with standing_in() as (_, url):
+        run(Options(url, players=3, seconds=1.2, warm_up_s=1.5), stages.append)
+    found = {name: [stage for stage in stages if stage.name == name] for name in dict.fromkeys(stage.name for stage in stages)}
+    assert list(found) == ["new players", "warm-up", "3 players"]
+    assert [(stage.done, stage.whole) for stage in found["new players"]] == [(1, 3), (2, 3), (3, 3)]
+    assert len(found["warm-up"]) == 2
+    assert found["3 players"][-1].done == 1.2
+    for some in found.values():
+        assert [stage.done for stage in some] == sorted(stage.done for stage in some)
 
 
 def test_a_warm_up_is_not_counted(standing_in: StandingIn) -> None:
@@ -137,8 +150,10 @@ def test_percentiles_are_of_each_tick_of_the_whole_test(standing_in: StandingIn)
     seen: list[Any] = []
     with standing_in(is_late=True, since=0, every=1, until=45) as (world, url):
         options = Options(url, players=1, seconds=3.7)
-        report = run(options, lambda at, recorder: seen.append(recorder))
+        report = run(options, lambda stage: seen.append(stage.recorder))
         assert world.tick > 45
+    assert seen[0] is None, "before there are clients"
+    seen = [recorder for recorder in seen if recorder is not None]
     ticks = len(seen[0].every("tick_ms"))
     # Ticks in order and none twice; the one that is under way when the server is asked is told of the next time.
     assert ticks == pytest.approx(report["ticks"], abs=1)
@@ -161,15 +176,17 @@ def test_a_server_without_live_figures(standing_in: StandingIn) -> None:
 
 def test_paths_speed_and_token_reach_the_server(standing_in: StandingIn, tmp_path: Path) -> None:
     path, token = tmp_path / "path.json", tmp_path / "token"
-    path.write_text("[[[0, 1, 2], [3, 4, 5]], [[6, 7, 8], [9, 0, 1.5]]]")
+    path.write_text("[[[0, 1, 2], [3, 4, 5]], [[6, 7, 8], [9, 0, 1.5], [6, 7, 8]]]")
     token.write_text("0123456789abcdef\n")
     with standing_in(token="0123456789abcdef") as (world, url):
         options = ["--players", "3", "--seconds", "1", "--path", str(path), "--speed", "30", "--token-file", str(token), "--seed", "9"]
         done = subprocess.run([*COMMAND, url, *options], check=False, capture_output=True, text=True, timeout=60)
         assert done.returncode == 0, done.stderr
         assert not world.players
-        paths = [wish["path"] for wish in sorted(world.made, key=lambda wish: wish["seed"])]
-        assert paths == [[[0, 1, 2], [3, 4, 5]], [[6, 7, 8], [9, 0, 1.5]], [[0, 1, 2], [3, 4, 5]]]
+        wishes = sorted(world.made, key=lambda wish: wish["seed"])
+        there, round_and_round = [[0, 1, 2], [3, 4, 5]], [[6, 7, 8], [9, 0, 1.5], [6, 7, 8]]
+        assert [wish["path"] for wish in wishes] == [there, round_and_round, there]
+        assert [wish["loop"] for wish in wishes] == [False, True, False]
         assert all(wish["speed"] == 30 for wish in world.made)
         refused = subprocess.run([*COMMAND, url], check=False, capture_output=True, text=True, timeout=60)
     assert refused.returncode == 2

@@ -130,12 +130,21 @@ def test_axes_end_at_round_numbers(value: float, expected: float) -> None:
 def test_path_files(tmp_path: Path) -> None:
     file = tmp_path / "path.json"
     file.write_text("[[0, 1, 2], [3, 4, 5.5]]")
-    assert read_paths(file) == [[(0, 1, 2), (3, 4, 5.5)]]
+    assert read_paths(file) == [((0, 1, 2), (3, 4, 5.5))]
     file.write_text("[[[0, 1, 2], [3, 4, 5.5]], [[1, 1, 1], [2, 2, 2], [3, 3, 3]]]")
     assert [len(path) for path in read_paths(file)] == [2, 3]
+    line = '{"type": "LineString", "coordinates": [[0, 2, 1], [3, 5.5, 4]]}'
+    file.write_text(line)
+    assert read_paths(file) == [((0, 1, 2), (3, 4, 5.5))]
+    feature = f'{{"type": "Feature", "geometry": {line}, "properties": {{}}}}'
+    file.write_text(f'{{"type": "FeatureCollection", "features": [{feature}, {feature}]}}')
+    assert read_paths(file) == 2 * [((0, 1, 2), (3, 4, 5.5))]
     for text in (
         "",
         "{}",
+        '{"type": "FeatureCollection", "features": []}',
+        '{"type": "FeatureCollection", "features": [1]}',
+        '{"type": "LineString", "coordinates": [[0, 2], [3, 5]]}',
         "[]",
         "[[]]",
         "[[0, 1, 2]]",
