@@ -40,17 +40,19 @@ class LightTrack:
         self._sky = sky
         self._worker = worker
         self._weather_at = weather_at
-        self._step_s = SHORTEST_STEP_S
+        self._step_s = 0.0
+        self._begin = _EPOCH
+        """From when on there are snapshots in such steps. The weather may be another from then on: none is made of the time before."""
         self._made: dict[int, Future[Lighting]] = {}
         self._standing: tuple[datetime, Future[Lighting]] | None = None
         self._blended: dict[tuple[int, int], Lighting] = {}
         """By step and part of it: of the moments that were asked for last."""
 
     def is_ready(self, moment: datetime, rate: float) -> bool:
-        """Whether ``at`` would not wait for the same; has made what it lacks."""
+        """Whether ``at`` would not wait for the same; what it lacks is made from now on."""
         if rate == 0:
             return self._have_standing(moment).done()
-        here = math.floor(self._steps(moment, rate))
+        here = self._step_of(moment, rate)
         self._have_made(here, here + 1)
         return self._made[here].done() and self._made[here + 1].done()
 
@@ -63,18 +65,18 @@ class LightTrack:
         if rate == 0:
             return self._have_standing(moment).result()
         self._standing = None
-        steps = self._steps(moment, rate)
-        here = math.floor(steps)
+        here = self._step_of(moment, rate)
         self._have_made(here, here + 1)
         # The one before stays for who looks ahead over its end, and then asks for now.
         for number in [n for n in self._made if not here - 1 <= n <= here + 2]:
             del self._made[number]
-        part = math.floor((steps - here) * BLENDS_PER_STEP)
+        begin = self._moment_of(here)
+        length = self._moment_of(here + 1) - begin
+        part = math.floor((moment - begin) / length * BLENDS_PER_STEP)
         found = self._blended.get((here, part))
         if found is None:
             first, second = self._made[here].result(), self._made[here + 1].result()
-            begin = _EPOCH + timedelta(seconds=(here + part / BLENDS_PER_STEP) * self._step_s)
-            time = begin.astimezone(moment.tzinfo).isoformat()
+            time = (begin + part / BLENDS_PER_STEP * length).astimezone(moment.tzinfo).isoformat()
             found = self._blended[here, part] = between_lightings(first, second, part / BLENDS_PER_STEP, time)
             while len(self._blended) > KEPT_BLENDS:
                 del self._blended[next(iter(self._blended))]
@@ -82,14 +84,18 @@ class LightTrack:
         self._have_made(here + 2)
         return found
 
-    def _steps(self, moment: datetime, rate: float) -> float:
-        """How many steps a moment is after the epoch, in steps that suit the rate: all are others when it asks for longer ones."""
+    def _step_of(self, moment: datetime, rate: float) -> int:
+        """The step that a moment is in. Where the rate asks for steps of another length, or the moment is before all, they begin anew."""
         step_s = max(SHORTEST_STEP_S, 2.0 ** math.ceil(math.log2(max(rate * STEP_REAL_S, 1.0))))
-        if step_s != self._step_s:
-            self._step_s = step_s
+        if step_s != self._step_s or moment < self._begin:
+            self._step_s, self._begin = step_s, moment.astimezone(UTC)
             self._made.clear()
             self._blended.clear()
-        return (moment - _EPOCH).total_seconds() / step_s
+        return math.floor((moment - _EPOCH).total_seconds() / step_s)
+
+    def _moment_of(self, number: int) -> datetime:
+        """When a step begins."""
+        return max(_EPOCH + timedelta(seconds=number * self._step_s), self._begin)
 
     def _have_standing(self, moment: datetime) -> Future[Lighting]:
         utc = moment.astimezone(UTC)  # equal only to the same moment, also in the hour that clocks repeat
@@ -100,12 +106,8 @@ class LightTrack:
     def _have_made(self, *numbers: int) -> None:
         for number in numbers:
             if number not in self._made:
-                self._made[number] = self._worker.submit(self._make, number, self._step_s)
-
-    def _make(self, number: int, step_s: float) -> Lighting:
-        moment = _EPOCH + timedelta(seconds=number * step_s)
-        # A clock that runs at 60 x makes two a second: kept, they would push out what queries ask for again and again.
-        return self._lighting(moment, keep=False)
+                # A clock that runs at 60 x makes two a second: kept, they would push out what queries ask for again and again.
+                self._made[number] = self._worker.submit(self._lighting, self._moment_of(number), keep=False)
 
     def _lighting(self, moment: datetime, keep: bool = True) -> Lighting:
         lighting = make_lighting(self._location, moment, self._weather_at(moment), keep)

@@ -15,7 +15,7 @@ from gi_core.lighting_model import _make_lighting, make_lighting
 from gi_core.lighting_steps import FASTEST_DAY, FASTEST_PLACE, TOLERANCE, largest_steps, main
 from gi_core.lighting_table import illuminance
 from gi_core.sun import sun_position
-from gi_core.weather import parse_weather
+from gi_core.weather import WEATHER_RANGES, Weather, between, parse_weather, weather_of
 from gi_core.world import Location
 
 # In a second, at the equator, where light changes fastest. Twilight grows 3.2-fold a degree at most, and the sun climbs 0.0042 degrees a
@@ -155,6 +155,28 @@ def test_a_clock_that_runs_leaves_what_queries_asked_for_in_memory() -> None:
             track.at(start + timedelta(minutes=second), 60.0)
     assert _make_lighting.cache_info().currsize == kept
     assert make_lighting(Location(), start + timedelta(hours=1)) is asked
+
+
+@pytest.mark.parametrize("rate", [1.0, 60.0])
+def test_weather_that_turns_into_another_moves_light_little_by_little(rate: float) -> None:
+    """Wherever in a step it begins, and where the clock's rate changes meanwhile: light of before it began would be of what it becomes."""
+    clear, overcast = parse_weather("clear"), parse_weather("overcast")
+    begin, lasts_s = datetime(2024, 6, 1, 16, 0, 7, tzinfo=UTC), 120.0
+
+    def weather_at(moment: datetime) -> Weather:
+        share = (moment - begin).total_seconds() / lasts_s
+        if not 0 <= share < 1:
+            return overcast
+        return weather_of({name: between(getattr(clear, name), getattr(overcast, name), share) for name in WEATHER_RANGES})
+
+    with ThreadPoolExecutor(1) as worker:
+        track = LightTrack(Location(), worker, weather_at)
+        steps = [(second, rate if second < 60 else 4 * rate) for second in range(140)]
+        suns = np.array([track.at(begin + timedelta(seconds=second), r).sun.irradiance.sum() for second, r in steps])
+    share = suns / make_lighting(Location(), begin).sun.irradiance.sum()
+    assert share[0] == pytest.approx(1, abs=1e-3)
+    assert share[-1] < 0.01
+    assert np.abs(np.diff(share)).max() < 0.02
 
 
 def test_the_last_evening_of_the_last_year_has_light() -> None:

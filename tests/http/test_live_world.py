@@ -80,8 +80,9 @@ def test_weather_turns_into_another_without_a_jump(live_http: httpx.Client) -> N
     live_http.put("/v1/clock", json={"time": "12:00", "rate": 60, "paused": False})
     told = live_http.put("/v1/weather", json={"weather": "overcast", "blend_s": 120}).json()
     assert told["asked"] == {"weather": "overcast"}
-    assert told["now"]["cloud_cover"] == 0  # it begins where it was
-    covers, ticks = [0.0], [told["tick"]]
+    # It begins where it was, in the tick in which it was asked for: that has its light a few ticks later.
+    assert 0 <= told["now"]["cloud_cover"] < 0.1
+    covers, ticks = [told["now"]["cloud_cover"]], [told["tick"]]
     while covers[-1] < 1:
         time.sleep(0.01)  # the blend takes two seconds, in which a quick machine would ask a thousand times
         now = live_http.get("/v1/weather").json()
