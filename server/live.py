@@ -5,23 +5,27 @@ A server that only answers queries has no live world: no thread, no memory, no k
 
 import logging
 import threading
+from collections.abc import Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 from gi_core.dataset import Dataset
 from gi_core.epw_weather import EpwWeather
+from gi_core.errors import InputError
 from gi_core.grid import SectorIndex
 from gi_core.live_world import DEFAULT_BUDGET_BYTES, LiveWorld
 from gi_core.user_sky import UserSky
 from server.kept_edits import KeptEdits, load_kept
-from server.live_state import LivePlayer, LiveState, LiveUnavailableError, NotKeptError, Residency, authored_lamps
-from server.live_weather import fixed_weather
+from server.live_state import LivePlayer, LiveState, LiveUnavailableError, NotKeptError, Part, Residency, authored_lamps
+from server.live_weather import fixed_weather, weather_from_json
 from server.players import Player, read_players
+from server.settings_json import changed_settings
 from server.street_lattice import StreetLattice
 from server.ticker import Ticker
-from server.world_clock import DEFAULT_TICKS_PER_SECOND, starting_clock
+from server.world_clock import DEFAULT_TICKS_PER_SECOND, changed_clock, starting_clock
 
 log = logging.getLogger("sectorlight.live")
 
@@ -147,4 +151,19 @@ class Live:
         walking = {player.id: self.walking(player, 0, False) for player in players}
         walking |= {player.id: self.walking(player, 0, True) for player in kept.players}
         boxes = {box.id: box for box in kept.boxes}
+        state = self._with_parts(state, kept.parts)
         return replace(state, lamps=MappingProxyType(lamps), boxes=MappingProxyType(boxes), players=MappingProxyType(walking))
+
+    def _with_parts(self, state: LiveState, parts: Mapping[Part, dict[str, Any]]) -> LiveState:
+        """Clock, weather and settings as the state file has them. Raises InputError."""
+        location = self.dataset.world.location
+        try:
+            if "clock" in parts:
+                state = replace(state, clock=changed_clock(state.clock, 0, parts["clock"], location))
+            if "weather" in parts:
+                state = replace(state, weather=weather_from_json(parts["weather"], location, self.measured)[0])
+            if "settings" in parts:
+                state = replace(state, settings=changed_settings(state.settings, parts["settings"]))
+        except InputError as error:
+            raise InputError(f"{self.options.state_file}: {error}") from error
+        return replace(state, kept=frozenset(parts))

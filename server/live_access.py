@@ -11,7 +11,8 @@ from typing import Annotated, Any, Protocol
 from fastapi import Depends
 
 from server.dependencies import ServiceDep
-from server.live_state import Applied, Command, LiveState, LiveUnavailableError
+from server.json_input import Members
+from server.live_state import Applied, Command, LiveState, LiveUnavailableError, Part
 from server.service import Service
 from server.ticker import Ticker
 
@@ -47,6 +48,11 @@ TickerDep = Annotated[Ticker, Depends(_for_reading)]
 WritingTickerDep = Annotated[Ticker, Depends(_for_writing)]
 
 
+# From what a request says to the command that does it. Raises InputError.
+Change = Callable[[dict[str, Any]], Command]
+KEEP = "true: written to the server's --state file, and back after a restart"
+
+
 class Kept(Protocol):
     """A player, a light, a box: whether it is back after a restart."""
 
@@ -63,6 +69,28 @@ async def keep(service: Service, is_concerned: bool) -> None:
     """Write the state file when something in it has changed."""
     if is_concerned:
         await asyncio.to_thread(service.live.keep)
+
+
+async def apply_to_part(service: Service, ticker: Ticker, part: Part, body: dict[str, Any], change: Change) -> Applied:
+    """Have what a body says of clock, weather or settings applied, and write the state file where that was kept or is from now on.
+
+    ``change`` gets the body without its ``keep``, which may be all that it says. Raises as ``apply`` does, and InputError."""
+    rest = {name: value for name, value in body.items() if name != "keep"}
+    keep_it = Members(body, part, body).flag("keep", False) if "keep" in body else None
+    if keep_it:
+        service.live.kept.expect_possible()
+    command = change(rest) if rest or keep_it is None else None
+    was_kept = False
+
+    def noted(state: LiveState, tick: int) -> LiveState:
+        nonlocal was_kept
+        was_kept = part in state.kept
+        after = state if command is None else command(state, tick)
+        return after.keeping(part, was_kept if keep_it is None else keep_it)
+
+    applied = await apply(ticker, noted)
+    await keep(service, was_kept or part in applied.state.kept)
+    return applied
 
 
 async def apply_to(

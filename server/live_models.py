@@ -7,12 +7,14 @@ from pydantic import BaseModel, Field
 from server.models import Vector3
 
 _TICK = Field(description="the tick that this was true in; of a write: the first in which it holds")
+_KEEP = Field(description="whether it is in the server's --state file, and back after a restart")
 
 
 class ClockReply(BaseModel):
     time: str = Field(description="local time with offset, ISO 8601")
     rate: float = Field(description="world seconds per second")
     paused: bool
+    keep: bool = _KEEP
     tick: int = _TICK
 
 
@@ -28,6 +30,7 @@ class WeatherNow(BaseModel):
 class WeatherReply(BaseModel):
     asked: dict[str, Any] = Field(description="what PUT was told last: weather, script_seed or measured")
     now: WeatherNow = Field(description="of this tick, on the way from one weather to another as well")
+    keep: bool = _KEEP
     tick: int = _TICK
 
 
@@ -42,6 +45,7 @@ class SettingsReply(BaseModel):
     ambient_down: Vector3 = Field(description="lux")
     exterior_ambient_scale: float
     interior_ambient_scale: float
+    keep: bool = _KEEP
     tick: int = _TICK
 
 
@@ -57,7 +61,7 @@ class Light(BaseModel):
     size: tuple[float, float] = Field(description="width and height of an area [m]")
     schedule: str
     dynamic: bool
-    keep: bool
+    keep: bool = _KEEP
 
 
 class LightReply(Light):
@@ -74,7 +78,7 @@ class Box(BaseModel):
     position: Vector3 = Field(description="of its middle, world metres")
     half_size: Vector3 = Field(description="along its own axes [m]")
     turned_degrees: float = Field(description="about the vertical, from +X towards -Z")
-    keep: bool
+    keep: bool = _KEEP
 
 
 class BoxReply(Box):
@@ -92,7 +96,7 @@ class Whereabouts(BaseModel):
     velocity: Vector3 = Field(description="m/s")
     heading_degrees: float = Field(description="0 looks along -Z, 90 along +X")
     since_tick: int = Field(description="when its walk began")
-    keep: bool
+    keep: bool = _KEEP
 
 
 class PlayerReply(Whereabouts):

@@ -23,6 +23,8 @@ from server.world_clock import WorldClock
 MAX_LAMPS = 20_000
 # Their triangles, twelve each, are drawn in one tick, at half a millisecond a thousand.
 MAX_BOXES = 256
+# What there is one of, and may be kept.
+Part = Literal["clock", "weather", "settings"]
 # What the live world has of a sector.
 Residency = Literal["read by a player", "resident", "failed", "not resident"]
 _NOT_OF_IDS = re.compile(r"[^A-Za-z0-9_-]+")
@@ -86,7 +88,11 @@ class LivePlayer:
 
 @dataclass(frozen=True, eq=False)
 class LiveState:
-    """The world as it is told to be at a tick. ``jumps`` counts what made light or players jump on purpose."""
+    """The world as it is told to be at a tick.
+
+    jumps : counts what made light or players jump on purpose
+    kept : which of clock, weather and settings are written to the state file, and back after a restart
+    """
 
     clock: WorldClock
     weather: WeatherSource
@@ -95,6 +101,7 @@ class LiveState:
     players: Mapping[str, LivePlayer] = field(default_factory=lambda: MappingProxyType({}))
     boxes: Mapping[str, LiveBox] = field(default_factory=lambda: MappingProxyType({}))
     jumps: int = 0
+    kept: frozenset[Part] = frozenset()
 
     @cached_property
     def moving_boxes(self) -> tuple[MovingBox, ...]:
@@ -144,6 +151,10 @@ class LiveState:
     def with_settings(self, settings: Settings) -> "LiveState":
         """Other settings, which light follows at once."""
         return replace(self, settings=settings, jumps=self.jumps + 1)
+
+    def keeping(self, part: Part, keep: bool) -> "LiveState":
+        """The same, with a part that is kept or is not."""
+        return self if keep == (part in self.kept) else replace(self, kept=self.kept ^ {part})
 
     def lamp(self, name: str) -> LiveLamp:
         """A lamp by its id. Raises NoSuchThingError."""

@@ -9,7 +9,7 @@ from fastapi.responses import JSONResponse
 
 from server.boxes_json import box_changed, box_from_json, box_to_json
 from server.dependencies import NoQuery, ServiceDep
-from server.live_access import TickerDep, WritingTickerDep, apply, apply_to, keep, reply_to
+from server.live_access import KEEP, TickerDep, WritingTickerDep, apply, apply_to, keep, reply_to
 from server.live_models import BoxesReply, BoxReply, GoneReply
 from server.write_access import WRITE, JsonBody, body_schema
 
@@ -19,7 +19,7 @@ _MEMBERS = {
     "position": "[x, y, z] of its middle, world metres",
     "half_size": "[x, y, z], half of its extent along its own axes [m], 0.01..100",
     "turned_degrees": "about the vertical, from +X towards -Z, -360..360",
-    "keep": "true: written to the server's --state file, and back after a restart",
+    "keep": KEEP,
 }
 _NEW = body_schema(
     {"id": "bus", "position": [40, 1.6, 60], "half_size": [6, 1.6, 1.3], "turned_degrees": 90},

@@ -5,9 +5,9 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query
 
 from server.dependencies import NoQuery, ServiceDep
-from server.live_access import TickerDep, WritingTickerDep, apply
+from server.live_access import KEEP, TickerDep, WritingTickerDep, apply_to_part
 from server.live_models import ClockReply
-from server.live_state import LiveState
+from server.live_state import Command, LiveState
 from server.world_clock import changed_clock, clock_to_json
 from server.write_access import WRITE, JsonBody, body_schema
 
@@ -18,6 +18,7 @@ _BODY = body_schema(
         "time": "jumps to `13:00` of the day that the clock shows, or to ISO 8601 with a date",
         "rate": "world seconds per second, 0..3600",
         "paused": "true stops it, false goes on at the same rate",
+        "keep": f"{KEEP}, where it shows what it was set to last",
     },
 )
 
@@ -26,7 +27,7 @@ _BODY = body_schema(
 def clock(ticker: TickerDep, _: Annotated[NoQuery, Query()]) -> dict[str, Any]:
     """What the live world's clock shows, and how fast it runs."""
     state, tick = ticker.state, ticker.tick
-    return clock_to_json(state.clock, max(tick, state.clock.start_tick))
+    return _reply(state, max(tick, state.clock.start_tick))
 
 
 @router.put("", response_model=ClockReply, dependencies=WRITE, openapi_extra=_BODY)
@@ -34,8 +35,15 @@ async def change_clock(body: JsonBody, service: ServiceDep, ticker: WritingTicke
     """Set time, rate or pause, all together from the tick that the reply names."""
     location = service.dataset.world.location
 
-    def command(state: LiveState, tick: int) -> LiveState:
-        return state.with_clock(changed_clock(state.clock, tick, body, location), is_jump="time" in body)
+    def change(rest: dict[str, Any]) -> Command:
+        def command(state: LiveState, tick: int) -> LiveState:
+            return state.with_clock(changed_clock(state.clock, tick, rest, location), is_jump="time" in rest)
 
-    applied = await apply(ticker, command)
-    return clock_to_json(applied.state.clock, applied.tick)
+        return command
+
+    applied = await apply_to_part(service, ticker, "clock", body, change)
+    return _reply(applied.state, applied.tick)
+
+
+def _reply(state: LiveState, tick: int) -> dict[str, Any]:
+    return {**clock_to_json(state.clock, tick), "keep": "clock" in state.kept}

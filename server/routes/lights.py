@@ -20,7 +20,7 @@ from gi_core.lights import (
 )
 from server.dependencies import NoQuery, ServiceDep
 from server.lamps_json import lamp_changed, lamp_from_json, lamp_to_json
-from server.live_access import TickerDep, WritingTickerDep, apply, apply_to, keep, reply_to
+from server.live_access import KEEP, TickerDep, WritingTickerDep, apply, apply_to, keep, reply_to
 from server.live_models import GoneReply, LightReply, LightsReply
 from server.write_access import WRITE, JsonBody, body_schema
 
@@ -38,7 +38,7 @@ _MEMBERS = {
     "size": f"[width, height] of an area [m], {MIN_SIZE_M:g}..{MAX_SIZE_M:g}",
     "schedule": "`always`, `night`, or local times as in `18:00-23:30`",
     "dynamic": "true for a lamp that moves all the time: it is worked out apart from those that stand still",
-    "keep": "true: written to the server's --state file, and back after a restart",
+    "keep": KEEP,
 }
 _NEW = body_schema(
     {"kind": "point", "position": [40, 4, 60], "lumens": 8000, "temperature_k": 2700},

@@ -10,7 +10,7 @@ from fastapi.responses import JSONResponse
 
 from gi_core.errors import InputError
 from server.dependencies import NoQuery, ServiceDep
-from server.live_access import TickerDep, WritingTickerDep, apply, apply_to, keep, reply_to
+from server.live_access import KEEP, TickerDep, WritingTickerDep, apply, apply_to, keep, reply_to
 from server.live_models import GoneReply, PlayerReply, PlayersReply
 from server.live_state import LivePlayer
 from server.players import MAX_DWELL_S, player_from_json
@@ -31,7 +31,7 @@ _BODY = body_schema(
         "seed": "of pauses, and of a walk along streets",
         "walk_m": f"how far a walk along streets goes before it turns back [m], {MIN_WALK_M:g}..{MAX_WALK_M:g}",
         "near": "[x, y, z] where a walk along streets starts",
-        "keep": "true: written to the server's --state file, and back after a restart",
+        "keep": KEEP,
     },
 )
 

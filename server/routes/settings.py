@@ -6,10 +6,10 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query
 
 from gi_core.settings import MAX_AMBIENT_LX, MAX_FACTOR
-from server.dependencies import NoQuery
-from server.live_access import TickerDep, WritingTickerDep, apply, reply_to
+from server.dependencies import NoQuery, ServiceDep
+from server.live_access import KEEP, TickerDep, WritingTickerDep, apply_to_part
 from server.live_models import SettingsReply
-from server.live_state import LiveState
+from server.live_state import Command, LiveState
 from server.settings_json import changed_settings
 from server.write_access import WRITE, JsonBody, body_schema
 
@@ -28,6 +28,7 @@ _BODY = body_schema(
         "ambient_down": f"irradiance added to faces that look down [lx]: {_COLOR}",
         "exterior_ambient_scale": f"ambient colours outdoors: {_FACTOR}",
         "interior_ambient_scale": f"ambient colours in rooms: {_FACTOR}",
+        "keep": KEEP,
     },
 )
 
@@ -36,15 +37,19 @@ _BODY = body_schema(
 def settings(ticker: TickerDep, _: Annotated[NoQuery, Query()]) -> dict[str, Any]:
     """The artists' panel as it is."""
     state, tick = ticker.state, ticker.tick
-    return {**asdict(state.settings), "tick": tick}
+    return _reply(state, tick)
 
 
 @router.put("", response_model=SettingsReply, dependencies=WRITE, openapi_extra=_BODY)
-async def change_settings(body: JsonBody, ticker: WritingTickerDep, _: Annotated[NoQuery, Query()]) -> dict[str, Any]:
+async def change_settings(body: JsonBody, service: ServiceDep, ticker: WritingTickerDep, _: Annotated[NoQuery, Query()]) -> dict[str, Any]:
     """Change some settings; those that the body does not name stay."""
 
-    def command(state: LiveState, tick: int) -> LiveState:
-        return state.with_settings(changed_settings(state.settings, body))
+    def change(rest: dict[str, Any]) -> Command:
+        return lambda state, _: state.with_settings(changed_settings(state.settings, rest))
 
-    applied = await apply(ticker, command)
-    return reply_to(applied, asdict(applied.state.settings))
+    applied = await apply_to_part(service, ticker, "settings", body, change)
+    return _reply(applied.state, applied.tick)
+
+
+def _reply(state: LiveState, tick: int) -> dict[str, Any]:
+    return {**asdict(state.settings), "keep": "settings" in state.kept, "tick": tick}

@@ -121,11 +121,60 @@ def test_what_is_kept_is_there_after_a_restart(
     assert load_kept(options.state_file, None).boxes == ()
 
 
+def test_clock_weather_and_settings_are_kept_where_they_ask_for_it(
+    city: Path, tmp_path: Path, serving: Serving, wait_until_live: Callable[[httpx.Client], None]
+) -> None:
+    options = LiveOptions(ticks_per_second=10, state_file=tmp_path / "state.json", start_time="09:00")
+    app = create_app(city, Settings(live=options))
+    with serving(app) as http:
+        wait_until_live(http)
+        kept = http.put("/v1/clock", json={"time": "2026-03-01T21:30", "paused": True, "keep": True}).json()
+        assert kept["keep"]
+        assert http.put("/v1/weather", json={"weather": "rain"}).json()["keep"] is False
+        assert http.put("/v1/weather", json={"keep": True}).json()["asked"] == {"weather": "rain"}
+        assert http.put("/v1/weather", json={"weather": "fog:0.5", "blend_s": 600}).json()["keep"], "as it was"
+        assert http.put("/v1/settings", json={"bounce_factor": 2.0, "keep": True}).status_code == 200
+        assert http.put("/v1/settings", json={"keep": False}).json()["bounce_factor"] == 2.0
+        assert http.put("/v1/settings", json={"sky_boost": [1, 2, 3], "keep": 1}).status_code == 400
+        assert http.put("/v1/clock", json={"keep": False, "rate": 1e9}).status_code == 400
+        assert http.put("/v1/clock", json={}).status_code == 400
+    assert "settings" not in json.loads(options.state_file.read_text())
+    app = create_app(city, Settings(live=options))
+    with serving(app) as http:
+        wait_until_live(http)
+        clock, weather = http.get("/v1/clock").json(), http.get("/v1/weather").json()
+        assert {**clock, "tick": 0} == {**kept, "tick": 0}
+        assert (weather["asked"]["weather"], weather["keep"]) == (weather["now"]["text"], True)
+        assert weather["now"]["fog_density"] > 0
+        assert http.get("/v1/settings").json()["bounce_factor"] == 1.0
+        assert http.put("/v1/settings", json={"sky_boost": [1, 2, 3], "keep": True}).status_code == 200
+    with serving(create_app(city, Settings(live=options))) as http:
+        wait_until_live(http)
+        assert http.get("/v1/settings").json()["sky_boost"] == [1, 2, 3]
+
+
+def test_a_state_file_that_would_be_too_large_to_read_again_is_left_as_it_was(
+    city: Path, tmp_path: Path, serving: Serving, problem_of: ProblemOf, wait_until_live: Any, monkeypatch: pytest.MonkeyPatch, street: Any
+) -> None:
+    monkeypatch.setattr("server.kept_edits.MAX_FILE_BYTES", 2000)
+    options = LiveOptions(ticks_per_second=10, state_file=tmp_path / "state.json")
+    with serving(create_app(city, Settings(live=options))) as http:
+        wait_until_live(http)
+        player = {"id": "a", "path": [street], "speed": 0, "keep": True}
+        assert http.post("/v1/players", json=player).status_code == 201
+        before = options.state_file.read_bytes()
+        reply = http.post("/v1/players", json=player | {"id": "b", "path": 100 * [street]})
+        assert (reply.status_code, problem_of(reply)["code"]) == (507, "not_kept")
+        assert options.state_file.read_bytes() == before
+
+
 def test_nothing_is_kept_without_a_file_and_that_is_said(city: Path, serving: Serving, problem_of: ProblemOf, street: Any) -> None:
     with serving(create_app(city, Settings())) as http:
-        reply = http.post("/v1/players", json={"id": "a", "path": [street], "keep": True})
-        assert reply.status_code == 400
-        assert "--state" in problem_of(reply)["detail"]
+        replies = [http.post("/v1/players", json={"id": "a", "path": [street], "keep": True})]
+        replies += [http.put(f"/v1/{part}", json={"keep": True}) for part in ("clock", "weather", "settings")]
+        for reply in replies:
+            assert reply.status_code == 400
+            assert "--state" in problem_of(reply)["detail"]
 
 
 def test_players_of_a_file_walk_from_the_start(city: Path, tmp_path: Path, serving: Serving, wait_until_live: Any, street: Any) -> None:
