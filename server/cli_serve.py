@@ -22,6 +22,9 @@ SHUTDOWN_GRACE_S = 5
 SWITCH_INTERVAL_S = 0.0005
 # A client that takes no bytes for so long is cut off, whoever waits: without it, one that stops reading would hold its stream for ever.
 UNSENT_MS = 60_000
+# What the system takes of a connection beyond what is under way. By itself it takes megabytes, and a stream's client who reads slowly would
+# see what was many seconds ago.
+UNSENT_BYTES = 1 << 16
 
 
 def run(dataset_path: Path, settings: Settings) -> None:
@@ -85,6 +88,8 @@ def bind(host: str, port: int) -> socket.socket:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         if hasattr(socket, "TCP_USER_TIMEOUT"):  # Linux; connections inherit it
             listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, UNSENT_MS)
+        if hasattr(socket, "TCP_NOTSENT_LOWAT"):
+            listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, UNSENT_BYTES)
         listener.bind(address)
     except OSError as error:
         if listener is not None:

@@ -1,6 +1,7 @@
 """Sectors come into the live world, late or never: nothing pops, and nothing waits for what cannot be loaded."""
 
 import shutil
+import threading
 import time
 from itertools import pairwise
 
@@ -12,9 +13,10 @@ from gi_core import live_world, stream
 from gi_core.dataset import Dataset, geometry_path, sector_path
 from gi_core.engine import Engine
 from gi_core.grid import SectorIndex
-from gi_core.live_sector import FADE_TICKS
+from gi_core.live_sector import AHEAD_TIMES, FADE_TICKS, HURRIED_TIMES, LiveSector
 from gi_core.live_volumes import HELD_TICKS
 from gi_core.live_world import MOST_PUT_OFF, LiveWorld, TickReport
+from gi_core.resident_sector import ResidentSector
 from gi_core.world import Lamp
 
 
@@ -47,6 +49,45 @@ def test_a_sector_is_lit_when_it_arrives(world, engine, monkeypatch):
     for before, sector in zip(arrived, residents.values(), strict=True):
         after = sector.resident.read_cubes()
         assert np.abs(before - after).max() <= 0.005 * after.max()
+
+
+def test_sectors_are_read_and_put_on_the_device_beside_the_ticks(engine, monkeypatch):
+    """Reading, decompressing, checking and uploading are a loader's; a tick takes over what is whole."""
+    threads = {"read": set(), "upload": set()}
+
+    def noting(what, method):
+        def noted(*args):
+            threads[what].add(threading.current_thread().name)
+            return method(*args)
+
+        return noted
+
+    monkeypatch.setattr(Dataset, "sector", noting("read", Dataset.sector))
+    world = LiveWorld(Dataset.open(GOLDEN), shadow_map=False)
+    monkeypatch.setattr(ResidentSector, "__init__", noting("upload", ResidentSector.__init__))
+    try:
+        Run(world).settle(at(STREET), light_of(world, engine.lighting("12:00", "clear")))
+    finally:
+        world.close()
+    assert threads == {"read": {"sector-loader_0"}, "upload": {"sector-loader_0"}}
+
+
+@pytest.mark.parametrize(("hurry_s", "times"), [(-1.0, AHEAD_TIMES), (np.inf, HURRIED_TIMES)])
+def test_who_is_waited_for_leaves_bounces_to_ticks(world, engine, monkeypatch, hurry_s, times):
+    """A sector that a volume already looks for comes after two bounces; in the end it shows the same."""
+    monkeypatch.setattr(live_world, "HURRY_S", hurry_s)
+    asked = []
+    light_ahead = LiveSector.light_ahead
+
+    def noted(sector, relighter, light, times):
+        asked.append(times)
+        light_ahead(sector, relighter, light, times)
+
+    monkeypatch.setattr(LiveSector, "light_ahead", noted)
+    lighting = engine.lighting("12:00", "clear")
+    found = Run(world).settle(at(STREET), light_of(world, lighting))
+    assert asked == 2 * [times]
+    np.testing.assert_array_equal(found, engine.volume(STREET, lighting).values)
 
 
 def test_a_damaged_geometry_file_costs_shadows_and_no_tick(tmp_path, engine, caplog):

@@ -1,6 +1,8 @@
 """A damaged sector file: its own light is refused by name, everything else keeps being served."""
 
+import io
 import logging
+import math
 import shutil
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -8,10 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import numpy as np
 import pytest
 from fastapi import FastAPI
+from serving import until
 
+from gi_core.constants import VOXEL_NO_SECTOR
 from server.app import create_app
+from server.live import LiveOptions
 from server.settings import Settings
 
 Serving = Callable[[FastAPI], AbstractContextManager[httpx.Client]]
@@ -92,3 +98,34 @@ def test_a_truncated_or_missing_sector_is_named_before_anyone_asks_for_it(
     assert named == {tuple(map(int, path.stem.split("_"))) for path in (first, last)}
     assert first.name in caplog.text
     assert last.name in caplog.text
+
+
+def test_a_live_world_reports_the_damaged_sector_and_heals_with_it(
+    damaged_city: Path, serving: Serving, wait_until_live: Callable[[httpx.Client], None], street: tuple[float, ...]
+) -> None:
+    """Meanwhile the distant probe stands in its place, and ticks go on."""
+    x, z = (math.floor(street[axis] / 64) for axis in (0, 2))
+    file = damaged_city / "sectors" / f"{x}_{z}.gisec"
+    original = file.read_bytes()
+    file.write_bytes(truncate(original))
+    with serving(create_app(damaged_city, Settings(live=LiveOptions(ticks_per_second=10)))) as http:
+        wait_until_live(http)
+        assert http.post("/v1/players", json={"id": "a", "path": [street], "speed": 0}).status_code == 201
+
+        def volume(**query: Any) -> np.ndarray:
+            return np.load(io.BytesIO(http.get("/v1/players/a/volume", params=query).content))
+
+        (failure,) = until(lambda: http.get("/v1/live").json()["failures"])
+        assert failure["sector"] == [x, z]
+        assert file.name in failure["reason"]
+        assert str(damaged_city) not in failure["reason"]
+        until(lambda: http.get("/v1/players/a/volume").status_code == 200)
+        missing = volume(mask=1) == VOXEL_NO_SECTOR
+        assert missing.any()
+        assert (volume()[:, missing].max(axis=(0, 2)) > 0).all()
+        before = until(lambda: (live := http.get("/v1/live").json())["misses"] > 0 and live)
+        file.write_bytes(original)
+        after = until(lambda: (live := http.get("/v1/live").json())["failures"] == [] and live)
+        assert after["failed_ticks"] == 0
+        assert after["ticks"] > before["ticks"]
+        until(lambda: (volume(mask=1)[missing] != VOXEL_NO_SECTOR).any())

@@ -314,6 +314,28 @@ def test_a_client_that_stops_reading_costs_a_message_and_holds_up_nobody(
     until(lambda: streams.clients == 0)
 
 
+def test_a_client_that_reads_slowly_gets_fewer_frames_and_ends_up_with_the_same(
+    live_http: httpx.Client, player: str, racing: None, streams: PlayerStreams
+) -> None:
+    """What it gets is whole and in order, and never a queue of what has been: it sees the present within what the system buffers."""
+    narrow = socket.socket()
+    narrow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 14)
+    narrow.connect((live_http.base_url.host, live_http.base_url.port))
+    address = f"ws://{live_http.base_url.netloc.decode()}/v1/players/{player}/stream"
+    with connect(address, sock=narrow, compression=None, max_size=1 << 24, max_queue=1) as connection:
+        follower, gaps = Follower(connection), []
+        deadline = time.monotonic() + PATIENCE_S
+        while sum(gap > 1 for gap in gaps) < 3:
+            assert time.monotonic() < deadline, "it was sent every frame"
+            gaps.append(follower.next().prefix.elapsed)
+            time.sleep(0.2)
+        live_http.put("/v1/clock", json={"time": "2024-06-21T12:00", "rate": 1, "paused": True})
+        follower.until_silent()
+        light = np.load(io.BytesIO(live_http.get(f"/v1/players/{player}/volume").content))
+        bound = 0.0105 * light.max(axis=(0, 4)) + 2.0**-15 * light.max()  # as above
+        assert (np.abs(follower.decoder.values - light) <= bound[..., None]).all()
+
+
 def test_a_client_that_vanishes_is_forgotten(live_http: httpx.Client, player: str, racing: None, streams: PlayerStreams) -> None:
     connection = raw_stream(live_http, player)
     until(lambda: streams.clients == 1)
