@@ -24,7 +24,11 @@ def serve(
     ] = None,
     state: Annotated[
         Path | None,
-        typer.Option(envvar="SECTORLIGHT_STATE", metavar="FILE", help="Where players, lights and boxes that ask to be kept are kept."),
+        typer.Option(
+            envvar="SECTORLIGHT_STATE",
+            metavar="FILE",
+            help="Where edits that ask to be kept are kept; its clock and weather go before --time and --weather.",
+        ),
     ] = None,
     epw: Annotated[
         Path | None, typer.Option(envvar="SECTORLIGHT_EPW", metavar="FILE", help="A measured year's weather, for PUT /v1/weather.")

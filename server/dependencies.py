@@ -119,7 +119,12 @@ class VolumeQuery(PositionQuery, VolumeFormatQuery):
 
 
 class PlayerVolumeQuery(VolumeFormatQuery):
-    since: int | None = Field(None, ge=-1, le=LARGEST_INTEGER, description="the tick that the client has: 304 when there is no later one")
+    since: int | None = Field(
+        None,
+        ge=-1,
+        le=LARGEST_INTEGER,
+        description="the tick that the client has, of this run of the server: 304 when there is no later one",
+    )
     stale: bool = Field(
         False, description="1: of each voxel's light the share (uint8, 255: all) that comes from probes which moving boxes hide from it"
     )
