@@ -1,7 +1,8 @@
 """A player's irradiance volume in the live world: kept on the device, and filled anew only where light has changed or the player moved.
 
-On the device each of its layers is a ring: a column's place is z * width + x of its lattice index, modulo the layer's columns. So all that
-a step leaves in sight stays where it is, only columns that come into sight are filled, and a layer is read in two pieces.
+On the device it is rings: a layer's place is y of its lattice index, modulo the volume's layers, a column's in it z * width + x, modulo
+the layer's columns. So all that a step leaves in sight stays where it is, only what comes into sight is filled, and it is read in four
+pieces.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -100,13 +101,13 @@ class LiveVolume:
             parts = (box,) if sector.shown_at > self._filled_at else new_parts if is_new else ()
             cubes = shown(sector) if parts else None
             for part in parts:
-                x, _, z = part.lattice_first
+                x, y, z = part.lattice_first
                 line, column = divmod(_on_ring(x, z), VOLUME_SHAPE[2])
-                placed = replace(part, volume_first=(column, part.volume_first[1], line))
+                placed = replace(part, volume_first=(column, y % VOLUME_SHAPE[0], line))
                 record = box_record(placed, sector.resident.sector)
                 sector.resident.fill_volume(record, part.size, self._buffer, cubes, self.basis)
         # Mapped: on a processor that is the device's own memory.
-        shape = (BASIS_SIZES[self.basis] * VOLUME_SHAPE[0], _COLUMNS, 3)
+        shape = (BASIS_SIZES[self.basis], VOLUME_SHAPE[0], _COLUMNS, 3)
         self._rings = cl.enqueue_map_buffer(self._device.queue, self._buffer, cl.map_flags.READ, 0, shape, np.float32, is_blocking=False)
 
     def publish(self, tick: int, placeholder: Callable[[SectorIndex], Float32]) -> PublishedVolume:
@@ -131,26 +132,28 @@ class LiveVolume:
         assert self._layout is not None
         assert self._rings is not None
         (rings, filled), self._rings = self._rings, None
-        first_x, _, first_z = self._layout.first.tolist()
-        at = _on_ring(first_x, first_z)
-        layers = values.reshape(rings.shape)
+        first_x, first_y, first_z = self._layout.first.tolist()
+        level, at = first_y % VOLUME_SHAPE[0], _on_ring(first_x, first_z)
+        rolled = values.reshape(rings.shape)
         filled.wait()
         with rings.base:
-            layers[:, : _COLUMNS - at] = rings[:, at:]
-            layers[:, _COLUMNS - at :] = rings[:, :at]
+            for to, of in (
+                (slice(0, VOLUME_SHAPE[0] - level), slice(level, None)),
+                (slice(VOLUME_SHAPE[0] - level, None), slice(0, level)),
+            ):
+                rolled[:, to, : _COLUMNS - at] = rings[:, of, at:]
+                rolled[:, to, _COLUMNS - at :] = rings[:, of, :at]
 
 
 def came_into_sight(box: SectorBox, first: Int64, before: Int64) -> list[SectorBox]:
-    """The parts of a box that a volume at ``first`` (3,) [lattice] shows and one at ``before`` did not; along y it is all or nothing."""
+    """The parts of a box that a volume at ``first`` (3,) [lattice] shows and one at ``before`` did not."""
     here, there, low = first.tolist(), before.tolist(), list(box.lattice_first)
     if here == there:
         return []
-    if here[1] != there[1]:
-        return [box]
     high = [at + count for at, count in zip(low, box.size, strict=True)]
     parts = []
-    for axis, count in ((0, VOLUME_SHAPE[2]), (2, VOLUME_SHAPE[1])):
-        # What lies on one side of where the volume was, then on the other; the other axis cuts what is left.
+    for axis, count in ((1, VOLUME_SHAPE[0]), (0, VOLUME_SHAPE[2]), (2, VOLUME_SHAPE[1])):
+        # What lies on one side of where the volume was, then on the other; the next axis cuts what is left.
         seen = max(low[axis], there[axis]), min(high[axis], there[axis] + count)
         for start, stop in ((low[axis], min(high[axis], there[axis])), (max(low[axis], there[axis] + count), high[axis])):
             if start < stop:

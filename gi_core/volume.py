@@ -64,7 +64,7 @@ Voxels = tuple[int, int, int]  # along x, y, z
 
 @dataclass(frozen=True, slots=True)
 class SectorBox:
-    """The part of a volume that one sector fills: first indices and size along (x, y, z), y being the whole height.
+    """The part of a volume that one sector fills, or a part of that: first indices and size along (x, y, z).
 
     Numbers of Python's: dozens of boxes are made in a tick, and small arrays take longer than what they are for.
     """

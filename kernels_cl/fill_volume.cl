@@ -3,8 +3,8 @@
 //   volume[b][y][z][x] = sum over the voxel's probes: voxel_weight * probe_cube[b]    [lx]
 //
 // Global size: (box x, box y, box z), one work-item per voxel of the box. Heights outside the sector's stored range read its lowest
-// or highest layer: above the roofs is open air. A box that reaches past the last column of a volume's layer goes on at the layer's first: a
-// layer of the volume of somebody who walks is a ring in memory, and a step writes new columns where the old ones were.
+// or highest layer: above the roofs is open air. A box that reaches past a volume's last layer goes on at its first, and past the last column
+// of a layer at the layer's first: the volume of somebody who walks is rings in memory, and a step writes new voxels where old ones were.
 //
 // Defines: BASIS_SIZE, VOXEL_PROBES.
 #ifndef BASIS_SIZE
@@ -44,7 +44,9 @@ __kernel void fill_volume(
     const int columns = box.volume_size[0] * box.volume_size[2];
     int column = (box.volume_first[2] + z) * box.volume_size[0] + box.volume_first[0] + x;
     column -= column >= columns ? columns : 0;
-    const uint at = (uint)(box.volume_first[1] + y) * columns + column;
+    int layer = box.volume_first[1] + y;
+    layer -= layer >= box.volume_size[1] ? box.volume_size[1] : 0;
+    const uint at = (uint)layer * columns + column;
     __attribute__((opencl_unroll_hint(BASIS_SIZE)))
     for (int b = 0; b < BASIS_SIZE; ++b)
     {

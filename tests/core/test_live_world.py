@@ -54,6 +54,29 @@ def test_a_volume_that_moved_shows_the_very_bytes_of_one_that_always_stood_there
         np.testing.assert_array_equal(shown.mask, query.mask)
 
 
+@pytest.mark.parametrize(("axis", "slab"), [(0, 16 * 32), (1, 32 * 32), (2, 16 * 32)])
+def test_a_step_of_one_voxel_fills_one_slab(world, engine, monkeypatch, axis, slab):
+    """There and back, along each axis: what stays in sight is neither filled nor moved."""
+    run, light, filled = Run(world), light_of(world, engine.lighting("12:00", "clear")), []
+    here = np.array([5.0, 2.0, 8.0])  # what comes into sight is in a sector
+    run.settle(at(here), light)
+    fill = ResidentSector.fill_volume
+
+    def counted(sector, record, size, *rest):
+        filled.append(int(np.prod(size)))
+        fill(sector, record, size, *rest)
+
+    monkeypatch.setattr(ResidentSector, "fill_volume", counted)
+    step, most = VOXEL_SIZE_M * np.eye(3)[axis], 0
+    for place in (here + step, here, here + step, here):
+        filled.clear()
+        run.tick(at(place), light)
+        assert sum(filled) <= slab
+        most = max(most, sum(filled))
+        np.testing.assert_array_equal(world.published("p0").values, engine.volume(place, engine.lighting("12:00", "clear")).values)
+    assert most > 0
+
+
 @pytest.mark.parametrize(("axis", "low", "high"), [(0, -45.0, 60.0), (1, 2.0, 80.0), (1, 2.0, 130.0), (2, -15.0, 90.0)])
 def test_a_player_who_jumps_by_more_than_a_volume_sees_the_very_bytes_of_a_query(world, engine, axis, low, high):
     run, lighting = Run(world), engine.lighting("12:00", "clear")
