@@ -13,7 +13,8 @@ other voxel filled from the nearest of them. Voxels in walls that are fitted to 
 All is in the dataset's basis: of harmonics, what they say of the six faces is compared with what exact harmonics would say. Their
 dataset has two stages more, ``shaded_cube`` and ``floor_cube``: the same points when the cube is served instead.
 
-A dataset with fine voxels has ``shaded_fine``: the same points read from volumes of cascade -1.
+A dataset with fine voxels has ``shaded_fine``: the same points read from volumes of cascade -1. One with rooms has ``shaded_rooms``:
+points on surfaces in rooms, which read interior volumes, and near openings a mix with what is beyond.
 
 Of the dataset only the served light is believed. Points come from ``compare_points``; surroundings that a partial bake leaves out
 must be handed in as ``scene``, or the reference is lit through the gap.
@@ -27,13 +28,14 @@ from typing import Any
 
 import numpy as np
 
-from bake_jobs.compare_points import CLIENT_OFFSET_M, SectorPoints, choose_points, corner_voxels, nearest_open_voxel
+from bake_jobs.compare_points import CLIENT_OFFSET_M, SectorPoints, choose_points, corner_voxels, nearest_open_voxel, points_in_rooms
 from bake_jobs.compare_report import StageSamples, summarise
 from bake_jobs.compare_states import DEFAULT_STATES, parse_states
 from bake_jobs.path_tracer import Estimate, PathTracer, Projector, cube_projector
 from bake_jobs.scene import Scene
 from gi_core.arrays import Float32, Float64, Int64
 from gi_core.basis import conversion, projection_weights
+from gi_core.client_light import Look, ServedLight
 from gi_core.constants import BASIS_SIZES, FINE_VOXEL_SIZE_M, SECTOR_SIZE_M, VOLUME_SHAPE, VOXEL_NO_SECTOR, VOXEL_OUTDOORS
 from gi_core.dataset import Dataset
 from gi_core.engine import Engine
@@ -50,7 +52,9 @@ DEFAULT_SECTORS = 9
 DAYLIGHT_LX = 100.0
 STAGES = ("probes", "near", "mid", "shaded", "floor")
 CUBE_STAGES = ("shaded_cube", "floor_cube")
-FINE_STAGES = ("shaded_fine",)
+FINE_STAGES, ROOM_STAGES = ("shaded_fine",), ("shaded_rooms", "shaded_rooms_cube")
+# Of the draw of points in rooms; those outdoors are the same with rooms and without.
+_IN_ROOMS = "1"
 # A volume of cascade -1 covers this much around its centre, wherever the lattice has it.
 FINE_TILE_M = FINE_VOXEL_SIZE_M * (np.array([VOLUME_SHAPE[2], VOLUME_SHAPE[0], VOLUME_SHAPE[1]]) - 4)
 Progress = Callable[[int, int, str], None]
@@ -155,12 +159,14 @@ def compare_dataset(
     tracer = _tracer(dataset, chosen, scene)
     bases = (world.basis,) if world.basis == "cube" else (world.basis, "cube")
     all_stages = STAGES + (CUBE_STAGES if len(bases) > 1 else ()) + (FINE_STAGES if world.has_fine_voxels else ())
+    all_stages += ROOM_STAGES[: len(bases)] if world.rooms else ()
     found = {state: {stage: StageSamples() for stage in all_stages} for state in lightings}
     air = {"open": 0, "called_solid": 0}
     dark: list[str] = []
 
     for number, index in enumerate(chosen):
         points = points_of(tracer, dataset, index, points_per_sector, seed)
+        in_rooms = points_in_rooms(dataset.geometry(index), world.rooms, points_per_sector, sector_rng(seed, index, _IN_ROOMS))
         for place, (state, lighting) in enumerate(lightings.items()):
             volume = engine.volume(points.eye, lighting)
             if place == 0:
@@ -180,6 +186,11 @@ def compare_dataset(
             _compare_surfaces(on_surfaces, served, points, reference, truth)
             if world.has_fine_voxels:
                 stages["shaded_fine"].add(_fine_light(engine, lighting, points), truth)
+            if len(in_rooms[0]):
+                truth = reference.surfaces(*in_rooms)
+                for stage, basis in zip(ROOM_STAGES, bases, strict=False):
+                    light = ServedLight.of(engine, lighting, Look(distant="off"), points.eye, basis=basis)
+                    stages[stage].add(light.irradiance(in_rooms[0], in_rooms[1].astype(np.float32)), truth)
             if any(stages[stage].lacks_light(is_day(lighting)) for stage in STAGES[:-1]):
                 dark.append(f"{index.x},{index.z} {state}")
             if progress is not None:

@@ -15,7 +15,9 @@ from gi_core.arrays import Bool, Float64, Int64
 from gi_core.constants import ROOM_OUTDOORS, SECTOR_SIZE_M, VOLUME_SHAPE, VOXEL_SIZE_M
 from gi_core.geometry_file import Geometry
 from gi_core.grid import SectorIndex, volume_first_voxel, voxel_centre
+from gi_core.rooms import EDGE_M, rooms_of
 from gi_core.sector import PROBE_IN_MARGIN, Sector
+from gi_core.world import Room
 
 EYE_HEIGHT_M = 1.7
 # A client reads the volume a quarter voxel off a surface: closer reads through it, farther reads other light.
@@ -27,6 +29,8 @@ LOOK_DIRECTIONS = 192
 SKY_RAYS_MIN = 2
 # Of the 96 downward rays. Above the very corner of the world's ground a quarter of them meets it; under the ground none does.
 GROUND_RAYS_MIN = 10
+# So far off a surface there is a room's air, or there is not.
+IN_ROOM_M = 0.02
 _POINTS_AT_ONCE = 2048
 
 
@@ -134,21 +138,8 @@ def _surface_points(
     rays: RayScene, geometry: Geometry, volume: tuple[Float64, tuple[int, int, int]], count: int, rng: np.random.Generator
 ) -> tuple[Float64, Float64]:
     """At most ``count`` points spread evenly over the sector's surface within the volume, and normals towards open air."""
-    corners = geometry.vertices[geometry.triangles]
-    a, edges_b, edges_c = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    doubled = np.cross(edges_b, edges_c)
-    length = np.linalg.norm(doubled, axis=1)
-    if not length.sum() > 0 or count == 0:
-        return np.zeros((0, 3)), np.zeros((0, 3))
     # Most of a tower's surface lies above the volume or faces another's inside: draw many and keep those that count.
-    chosen = rng.choice(len(length), 64 * count, p=length / length.sum())
-    u, v = rng.random((2, len(chosen), 1))
-    folded = u + v > 1
-    u, v = np.where(folded, 1 - u, u), np.where(folded, 1 - v, v)
-    point = a[chosen] + u * edges_b[chosen] + v * edges_c[chosen]
-    normal = doubled[chosen] / length[chosen, None]
-    normal[rng.random(len(normal)) < 0.5] *= -1
-
+    point, normal = _drawn_on(geometry.vertices[geometry.triangles], 64 * count, rng)
     low, high = volume[0], volume[0] + VOXEL_SIZE_M * (np.array(volume[1])[[2, 0, 1]] - 1)
     inside = ((point - CLIENT_OFFSET_M >= low) & (point + CLIENT_OFFSET_M <= high)).all(axis=1)
     some = np.flatnonzero(inside)[: 16 * count]
@@ -157,6 +148,35 @@ def _surface_points(
     normal = np.where(in_front[:, None], normal, -normal)
     found = np.flatnonzero(in_front | behind)[:count]
     return point[found], normal[found]
+
+
+def points_in_rooms(geometry: Geometry, rooms: tuple[Room, ...], count: int, rng: np.random.Generator) -> tuple[Float64, Float64]:
+    """At most ``count`` points spread evenly over a sector's surfaces in rooms, at any height, and normals into their air: (n, 3) each."""
+    corners = geometry.vertices[geometry.triangles]
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    may = np.zeros(len(corners), bool)
+    for room in rooms:
+        may |= ((high >= np.array(room.minimum) - EDGE_M) & (low <= np.array(room.maximum) + EDGE_M)).all(axis=1)
+    point, normal = _drawn_on(corners[may], 16 * count, rng)
+    sides = [rooms_of(point + sign * IN_ROOM_M * normal, rooms) != ROOM_OUTDOORS for sign in (1, -1)]
+    found = np.flatnonzero(sides[0] | sides[1])[:count]
+    return point[found], np.where(sides[0][found, None], normal[found], -normal[found])
+
+
+def _drawn_on(corners: Float64, count: int, rng: np.random.Generator) -> tuple[Float64, Float64]:
+    """``count`` points spread evenly over triangles (n, 3, 3) [m], and normals, each of either sign; none where there is no area."""
+    a, edges_b, edges_c = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    doubled = np.cross(edges_b, edges_c)
+    length = np.linalg.norm(doubled, axis=1)
+    if not length.sum() > 0 or count == 0:
+        return np.zeros((0, 3)), np.zeros((0, 3))
+    chosen = rng.choice(len(length), count, p=length / length.sum())
+    u, v = rng.random((2, len(chosen), 1))
+    folded = u + v > 1
+    u, v = np.where(folded, 1 - u, u), np.where(folded, 1 - v, v)
+    normal = doubled[chosen] / length[chosen, None]
+    normal[rng.random(len(normal)) < 0.5] *= -1
+    return a[chosen] + u * edges_b[chosen] + v * edges_c[chosen], normal
 
 
 def _open_air_off(rays: RayScene, point: Float64, normal: Float64) -> Bool:

@@ -291,16 +291,16 @@ class Engine:
                     ResidentGrid(self._device, grid).fill(box, target, resident.converted(basis), basis)
             self._device.read(target, values)
         inside = _in_room(lit_rooms, wanted)
-        sectors = tuple(box.index for box in boxes)
+        sectors, expected = tuple(box.index for box in boxes), self._expected_error(basis, in_rooms=True)
         if wanted and not reached and (found := self._between_voxels(wanted, sectors, first, light, basis)) is not None:
             values, lit = found
-            return Volume(values, mask, first, sectors, basis, residual=self._residual(lit, light), rooms=(wanted,))
+            return Volume(values, mask, first, sectors, basis, expected, residual=self._residual(lit, light), rooms=(wanted,))
         if not inside.any():
             there = f"room {rooms[wanted - 1].name!r}" if wanted else "a room"
             lacks = f"has no probe in {there}" if reached else f"reaches no voxel of {there}; GET /v1/world lists rooms"
             raise InputError(f"kind=interior: the volume around this place {lacks}")
         values = np.ascontiguousarray(values[(slice(None), *nearest(inside))])
-        return Volume(values, mask, first, sectors, basis, residual=self._residual(lit, light), rooms=tuple(sorted(reached)))
+        return Volume(values, mask, first, sectors, basis, expected, residual=self._residual(lit, light), rooms=tuple(sorted(reached)))
 
     def _between_voxels(
         self, room: int, sectors: Sequence[SectorIndex], first: Int64, light: _Light, basis: str
@@ -396,8 +396,8 @@ class Engine:
             raise InputError(f"basis: this dataset was baked in {own}; expected {' or '.join(served_from(own))}, found {basis}")
         return own if basis is None else basis
 
-    def _expected_error(self, basis: str, cascade: int = 0) -> float | None:
-        return expected_error(self.dataset.world.error_report, self.dataset.world.basis, basis, cascade)
+    def _expected_error(self, basis: str, cascade: int = 0, in_rooms: bool = False) -> float | None:
+        return expected_error(self.dataset.world.error_report, self.dataset.world.basis, basis, cascade, in_rooms)
 
     def _set_lamps(self, resident: ResidentSector, lamps: tuple[Lamp, ...]) -> None:
         index = resident.sector.index

@@ -82,7 +82,7 @@ def _report(world: WorldInfo) -> Table:
     """What ``compare`` measured: median, 95th percentile and bias of each stage in each state, in per cent."""
     report = world.error_report or {}
     states = {name: stages for name, stages in report.get("states", {}).items() if isinstance(stages, Mapping)}
-    rows = ("probes", "near", "mid", "shaded", "floor", "shaded_cube", "floor_cube", "shaded_fine")
+    rows = ("probes", "near", "mid", "shaded", "floor", "shaded_cube", "floor_cube", "shaded_fine", "shaded_rooms", "shaded_rooms_cube")
     expected = expected_error(report, world.basis, world.basis)
     title = "Error report: median / 95th percentile / bias [%]"
     table = Table(title=title if expected is None else f"{title}; expected on surfaces: {100 * expected:.1f} %", title_justify="left")

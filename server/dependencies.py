@@ -14,12 +14,12 @@ from pydantic_core import PydanticCustomError
 from starlette.requests import HTTPConnection
 
 from gi_core.arrays import Float64
+from gi_core.client_light import Beyond
 from gi_core.constants import MAX_CASCADE
 from gi_core.distant_file import DistantLight
 from gi_core.errors import InputError
 from gi_core.json_fields import LARGEST_INTEGER
 from server.encoding import ArrayFormat, RawEncoding, VolumeFormat
-from server.preview_light import Beyond
 from server.preview_views import ViewName
 from server.service import Service
 

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from gi_core.arrays import Float32, Float64, Int32, Int64
+from gi_core.client_light import PLAIN_LOOK, Indirect, Look, ServedLight
 from gi_core.engine import Engine
 from gi_core.lighting import Lighting
 from gi_core.lights import lamps_on
@@ -24,7 +25,6 @@ from server.camera import Camera
 from server.preview_air import background, plain_distance, through_fog
 from server.preview_fog import add_fog_light
 from server.preview_lamps import draw_lamps, lamp_irradiance
-from server.preview_light import PLAIN_LOOK, Indirect, Look, ServedLight
 from server.preview_occlusion import kept_by_decals, kept_share
 from server.preview_scene import PreviewScene
 from server.raycast import RayCaster

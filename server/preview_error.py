@@ -12,13 +12,13 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from gi_core.arrays import Float32, Float64, UInt8
+from gi_core.client_light import Look, ServedLight
 from gi_core.error_report import DARKEST_SHARE_OF_MEAN
 from gi_core.lighting import Lighting
 from gi_core.lights import lamps_on
 from gi_core.spectrum import LUMINANCE_FROM_RGB
 from server.camera import Camera
 from server.preview import indirect_irradiance
-from server.preview_light import Look, ServedLight
 from server.preview_scene import PreviewScenes
 from server.service import Service
 

@@ -20,11 +20,11 @@ Left out: what lamps give fog directly, and that fog dims the sun's rays on thei
 import numpy as np
 
 from gi_core.arrays import Float32, Float64, Int64
+from gi_core.client_light import ServedLight
 from gi_core.lighting import Lighting
 from gi_core.phase import aerosol_phase
 from server.camera import Camera
 from server.preview_air import mean_sky, open_ground_radiance
-from server.preview_light import ServedLight
 from server.raycast import RayCaster
 
 Taps = list[tuple[Int64, Float64]]

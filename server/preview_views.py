@@ -8,6 +8,7 @@ import numpy as np
 
 from gi_core import ambient_cube
 from gi_core.arrays import Float32, Float64, Int64, UInt8
+from gi_core.client_light import SAMPLE_OFFSET_M, Look, ServedLight, plan_volumes
 from gi_core.constants import ROOM_OUTDOORS, SECTOR_SIZE_M, VOXEL_INDOORS, VOXEL_NO_SECTOR, VOXEL_OUTDOORS, VOXEL_SIZE_M, VOXEL_SOLID
 from gi_core.engine import Engine, LitProbes
 from gi_core.errors import OutsideWorldError
@@ -19,7 +20,6 @@ from server.camera import Camera
 from server.labels import with_key
 from server.live_state import Residency
 from server.preview import STRAIGHT_UP, city_radiance
-from server.preview_light import SAMPLE_OFFSET_M, Look, ServedLight, plan_volumes
 from server.preview_scene import PreviewScene
 from server.preview_seen import NO_SURFACE, Seen
 

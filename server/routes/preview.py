@@ -5,6 +5,7 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 
+from gi_core.client_light import Look
 from gi_core.errors import InputError
 from gi_core.lighting import Lighting
 from server import preview_views, tonemap
@@ -15,7 +16,6 @@ from server.encoding import REPLY_VERSION
 from server.openapi import NOT_CHANGED, reply
 from server.preview import city_radiance
 from server.preview_error import error_picture
-from server.preview_light import Look
 from server.service import Service
 
 router = APIRouter(prefix="/v1", tags=["pictures"])

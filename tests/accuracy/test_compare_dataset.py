@@ -37,9 +37,10 @@ class PlainDataset:
     wall_height_m = 0.0  # of a black wall along z through the middle of every sector
     basis = "cube"
     has_fine_voxels = False
+    rooms = ()
 
     def __init__(self, sectors=PLAIN):
-        facts = {"basis": self.basis, "lamps": self.lamps, "has_fine_voxels": self.has_fine_voxels}
+        facts = {"basis": self.basis, "lamps": self.lamps, "rooms": self.rooms, "has_fine_voxels": self.has_fine_voxels}
         self.world = SimpleNamespace(preset="talk", location=Location(), sectors=sectors, bake_id="ab", **facts)
 
     def geometry(self, index):

@@ -13,12 +13,12 @@ import pytest
 from bake_jobs.config import settings_for
 from bake_jobs.path_tracer import PathTracer
 from bake_jobs.placement import has_voxels
+from gi_core.client_light import Look, ServedLight
 from gi_core.constants import VOXEL_INDOORS
 from gi_core.dataset import Dataset
 from gi_core.engine import Engine
 from gi_core.volume import sample_volume
 from gi_core.world import Lamp, Location, Room
-from server.preview_light import Look, ServedLight
 
 LEAK = 1e-3
 QUICK = {"rays_per_face_edge": 8, "trial_rays_per_face_edge": 5, "sun_declination_step_degrees": 40.0, "sun_hour_step_degrees": 30.0}

@@ -2,10 +2,10 @@
 
 import numpy as np
 
+from gi_core.client_light import EXTENT_M, FADE_M, MAX_VOLUMES, ServedLight, near_share, sample_distant
 from gi_core.constants import SECTOR_SIZE_M, VOLUME_SHAPE, VOXEL_SIZE_M
 from gi_core.engine import Distant
 from gi_core.grid import SectorIndex, volume_first_voxel, voxel_centre
-from server.preview_light import EXTENT_M, FADE_M, MAX_VOLUMES, ServedLight, near_share, sample_distant
 
 UP = np.array([0.0, 1.0, 0.0], np.float32)
 NEAR, FAR = 300.0, 700.0

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from gi_core.client_light import ServedLight
 from gi_core.constants import VOLUME_SHAPE, VOXEL_SIZE_M
 from gi_core.grid import volume_first_voxel, voxel_centre
 from gi_core.lighting import DirectionalLight, Lighting
@@ -13,7 +14,6 @@ from server.camera import Camera
 from server.preview import render
 from server.preview_air import mean_sky
 from server.preview_fog import BLOCK, PATTERN, add_fog_light, marched, open_mean_radiance, spread_blocks, way
-from server.preview_light import ServedLight
 from server.preview_scene import PreviewScene
 from server.raycast import RayCaster
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from gi_core.client_light import ServedLight
 from gi_core.constants import SNOW_ALBEDO, VOLUME_SHAPE, VOXEL_SIZE_M
 from gi_core.grid import volume_first_voxel, voxel_centre
 from gi_core.lighting import DirectionalLight, Lighting
@@ -12,7 +13,6 @@ from server.camera import Camera
 from server.preview import render
 from server.preview_air import mean_sky, plain_distance, through_fog
 from server.preview_lamps import PixelCells, draw_lamps, lamp_irradiance
-from server.preview_light import ServedLight
 from server.preview_scene import PreviewScene
 from server.raycast import RayCaster
 

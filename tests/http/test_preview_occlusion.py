@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
+from gi_core.client_light import Look, ServedLight
 from gi_core.constants import VOLUME_SHAPE, VOXEL_SIZE_M
 from gi_core.decals import hidden_share
 from gi_core.grid import volume_first_voxel, voxel_centre
 from gi_core.world import Decal
 from server.preview import indirect_irradiance
-from server.preview_light import Look, ServedLight
 from server.preview_occlusion import NEAR_ALBEDO, REACH_M, kept_by_decals, kept_share, sphere_lattice
 from server.raycast import RayCaster
 

@@ -11,6 +11,7 @@ from PIL import Image
 
 from bake_jobs.solids import boxes
 from gi_core.ambient_cube import FACE_DIRECTIONS
+from gi_core.client_light import MAX_VOLUMES, Look, ServedLight, plan_volumes
 from gi_core.constants import VOLUME_SHAPE, VOXEL_SIZE_M
 from gi_core.grid import SectorIndex, volume_first_voxel, voxel_centre
 from gi_core.lighting import DirectionalLight, Lighting
@@ -19,7 +20,6 @@ from server import tonemap
 from server.camera import Camera
 from server.preview import indirect_pixels, render
 from server.preview_air import background
-from server.preview_light import MAX_VOLUMES, Look, ServedLight, plan_volumes
 from server.preview_scene import MAX_SECTORS, PreviewScene, plan_sectors
 from server.raycast import RayCaster
 

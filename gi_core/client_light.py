@@ -1,4 +1,4 @@
-"""Served light as a picture reads it: volumes, and beyond them the texture of distant sectors (slide "Distant shading").
+"""Served light as a client reads it: volumes, and beyond them the texture of distant sectors (slide "Distant shading").
 
     in a room              its interior volume; at its openings, on both sides, a mix with what is beyond (gi_core.rooms.light_shares)
     in a volume's box      the volume
@@ -94,23 +94,27 @@ class ServedLight:
     coarser: tuple[Volume, ...] = ()
 
     @classmethod
-    def of(cls, engine: Engine, lighting: Lighting, look: Look, eye: Float64, settings: Settings = NEUTRAL) -> "ServedLight":
-        """An engine's light under the artists' settings, as a look has it, seen from an eye (3,) [m]. Raises InputError for a distant light
-        that was not baked, CorruptFileError."""
+    def of(
+        cls, engine: Engine, lighting: Lighting, look: Look, eye: Float64, settings: Settings = NEUTRAL, basis: str | None = None
+    ) -> "ServedLight":
+        """An engine's light under the artists' settings, as a look has it, seen from an eye (3,) [m], of volumes in a basis, the dataset's
+        where it is None. Raises InputError for a distant light that was not baked, CorruptFileError."""
         low, high = engine.dataset.world.bounds
 
         def volume_at(position: Float64, room: int) -> Volume:
             # A tile's centre may lie beyond the world's edge though its pixels do not.
             inside = np.clip(position, low, high)
             try:
-                return engine.interior(inside, lighting, settings, room=str(room)) if room else engine.volume(inside, lighting, settings)
+                if room:
+                    return engine.interior(inside, lighting, settings, basis, str(room))
+                return engine.volume(inside, lighting, settings, basis)
             except InputError:  # a room without a probe, or out of the one volume's reach: nothing is known of it, the street's light least
-                outdoors = engine.volume(inside, lighting, settings)
+                outdoors = engine.volume(inside, lighting, settings, basis)
                 return replace(outdoors, values=np.zeros_like(outdoors.values))
 
         distant = None if look.distant == "off" else engine.distant(settings.light(lighting), look.distant_light)
         world, coarser = engine.dataset.world, range(1, MAX_CASCADE + 1) if look.distant == "cascades" else ()
-        cascades = tuple(engine.volume(np.clip(eye, low, high), lighting, settings, cascade=n) for n in coarser)
+        cascades = tuple(engine.volume(np.clip(eye, low, high), lighting, settings, basis, n) for n in coarser)
         player = eye if look.distant in ("client", "cascades") else None
         return cls(volume_at, distant, player, world.rooms if look.interior else (), world.decals, cascades)
 
