@@ -57,7 +57,7 @@ from gi_core.sector import Sector
 from gi_core.sun_table import SunTable
 
 # Part of the bake id: raised whenever the same settings would give other bytes than before.
-BAKER_VERSION = 9
+BAKER_VERSION = 10
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 SectorRange = tuple[tuple[int, int], tuple[int, int]]
 

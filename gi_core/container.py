@@ -10,6 +10,7 @@ import math
 import os
 import struct
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -76,17 +77,17 @@ def encode(
     ``delta`` names integer arrays that are stored as differences along their last axis (they wrap around). Multi-byte values are
     stored as byte planes, least significant first, which compress far better than interleaved bytes.
     """
-    table, chunks = [], []
+    table: list[dict[str, Any]] = []
+    planes: list[bytes] = []
     for name, values in arrays.items():
         code = values.dtype.newbyteorder("<").str[1:]
         if code not in _DTYPES:
             raise TypeError(f"array {name!r}: dtype {values.dtype} cannot be stored")
         table.append({"name": name, "dtype": code, "shape": list(values.shape), "delta": name in delta})
-        chunks.append(_pack(np.ascontiguousarray(values, np.dtype("<" + code)), name in delta))
+        planes += _pack(np.ascontiguousarray(values, np.dtype("<" + code)), name in delta)
     header = json.dumps({"meta": meta, "arrays": table}, separators=(",", ":"), sort_keys=True).encode()
-    raw = b"".join(chunks)
-    payload = zstandard.ZstdCompressor(level=level, write_checksum=True).compress(raw)
-    prefix = _PREFIX.pack(MAGIC, kind.encode(), version, len(header), 0, len(payload), len(raw), bytes(16))
+    payload, raw_bytes = _compress(planes, level), sum(map(len, planes))
+    prefix = _PREFIX.pack(MAGIC, kind.encode(), version, len(header), 0, len(payload), raw_bytes, bytes(16))
     digest = _digest(prefix, header, payload)
     return prefix[:_DIGEST_OFFSET] + digest + prefix[_DIGEST_OFFSET + 16 :] + header + payload
 
@@ -189,11 +190,20 @@ def interleaved(rows: AnyArray) -> AnyArray:
     return out
 
 
-def _pack(values: AnyArray, delta: bool) -> bytes:
+def _compress(planes: Sequence[bytes], level: int) -> bytes:
+    """One frame, in which each plane begins a block: a block has one code for all of its bytes, which suits one kind of them. 1 % less."""
+    filled = [plane for plane in planes if plane]
+    packer = zstandard.ZstdCompressor(level=level, write_checksum=True).compressobj(size=sum(map(len, filled)))
+    packed = [part for plane in filled for part in (packer.compress(plane), packer.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK))]
+    return b"".join([*packed, packer.flush()])
+
+
+def _pack(values: AnyArray, delta: bool) -> list[bytes]:
+    """The byte planes of an array."""
     if delta and values.size:
         values = np.concatenate([values[..., :1], np.diff(values, axis=-1)], axis=-1)
     octets = values.reshape(-1).view(np.uint8).reshape(-1, values.dtype.itemsize)
-    return np.ascontiguousarray(octets.T).tobytes()
+    return [plane.tobytes() for plane in octets.T]
 
 
 def _unpack(raw: memoryview, dtype: "np.dtype[Any]", shape: tuple[int, ...], delta: bool) -> AnyArray:
