@@ -253,7 +253,7 @@ def _tracer(dataset: Dataset, chosen: Sequence[SectorIndex], scene: Scene | None
 
 def points_of(tracer: PathTracer, dataset: Dataset, index: SectorIndex, count: int, seed: int) -> SectorPoints:
     """Where a sector is compared."""
-    return choose_points(tracer.rays, dataset.geometry(index), dataset.sector(index), count, sector_rng(seed, index))
+    return choose_points(tracer.rays, dataset.geometry(index), dataset.sector(index), count, sector_rng(seed, index), dataset.world.rooms)
 
 
 def sector_rng(seed: int, index: SectorIndex, digest: str = "") -> np.random.Generator:

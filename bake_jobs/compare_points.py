@@ -11,7 +11,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 
 from bake_jobs.rays import SURFACE_OFFSET_M, RayScene
-from gi_core.arrays import Bool, Float64, Int64
+from gi_core.arrays import Bool, Float64, Int64, UInt16
 from gi_core.constants import ROOM_OUTDOORS, SECTOR_SIZE_M, VOLUME_SHAPE, VOXEL_SIZE_M
 from gi_core.geometry_file import Geometry
 from gi_core.grid import SectorIndex, volume_first_voxel, voxel_centre
@@ -63,8 +63,10 @@ class SectorPoints:
     open_voxel: Bool
 
 
-def choose_points(rays: RayScene, geometry: Geometry, sector: Sector, count: int, rng: np.random.Generator) -> SectorPoints:
-    """At most ``count`` points of each kind in one sector."""
+def choose_points(
+    rays: RayScene, geometry: Geometry, sector: Sector, count: int, rng: np.random.Generator, rooms: tuple[Room, ...] = ()
+) -> SectorPoints:
+    """At most ``count`` points of each kind in one sector, none in one of the ``rooms``: through windows these see the sky too."""
     eye = standing_eye(rays, sector.index, geometry)
     first = volume_first_voxel(eye)
     index = np.argwhere(np.ones(VOLUME_SHAPE, bool))  # (y, z, x)
@@ -72,10 +74,11 @@ def choose_points(rays: RayScene, geometry: Geometry, sector: Sector, count: int
     seen = look_around(rays, centre)
     origin = sector.index.origin
     in_sector = ((centre >= origin) & (centre < origin + SECTOR_SIZE_M))[:, [0, 2]].all(axis=1)
-    free = seen.open_air & in_sector
+    outside = seen.open_air & (rooms_of(centre, rooms) == ROOM_OUTDOORS)
+    free = outside & in_sector
     probe_position = sector.probe_position.astype(np.float64) + origin
     outdoors = (sector.probe_room == ROOM_OUTDOORS) & (sector.probe_flags & PROBE_IN_MARGIN == 0)
-    surface, normal = _surface_points(rays, geometry, (voxel_centre(first), VOLUME_SHAPE), count, rng)
+    surface, normal = _surface_points(rays, geometry, voxel_centre(first), rooms, count, rng)
     near = index[_some(np.flatnonzero(free & (seen.distance <= NEAR_M)), count, rng)]
     mid = index[_some(np.flatnonzero(free & (seen.distance >= MID_M)), count, rng)]
     # Probes come last: all other points are the same for whatever was baked of a place.
@@ -88,7 +91,7 @@ def choose_points(rays: RayScene, geometry: Geometry, sector: Sector, count: int
         mid=mid,
         surface=surface,
         normal=normal,
-        open_voxel=seen.open_air.reshape(VOLUME_SHAPE),
+        open_voxel=outside.reshape(VOLUME_SHAPE),
     )
 
 
@@ -135,16 +138,17 @@ def corner_voxels(points: Float64, origin: Float64) -> Int64:
 
 
 def _surface_points(
-    rays: RayScene, geometry: Geometry, volume: tuple[Float64, tuple[int, int, int]], count: int, rng: np.random.Generator
+    rays: RayScene, geometry: Geometry, low: Float64, rooms: tuple[Room, ...], count: int, rng: np.random.Generator
 ) -> tuple[Float64, Float64]:
-    """At most ``count`` points spread evenly over the sector's surface within the volume, and normals towards open air."""
+    """At most ``count`` points spread evenly over the sector's surface within the volume, whose first voxel's centre is ``low`` (3,) [m],
+    and normals towards open air."""
     # Most of a tower's surface lies above the volume or faces another's inside: draw many and keep those that count.
     point, normal = _drawn_on(geometry.vertices[geometry.triangles], 64 * count, rng)
-    low, high = volume[0], volume[0] + VOXEL_SIZE_M * (np.array(volume[1])[[2, 0, 1]] - 1)
+    high = low + VOXEL_SIZE_M * (np.array(VOLUME_SHAPE)[[2, 0, 1]] - 1)
     inside = ((point - CLIENT_OFFSET_M >= low) & (point + CLIENT_OFFSET_M <= high)).all(axis=1)
     some = np.flatnonzero(inside)[: 16 * count]
     point, normal = point[some], normal[some]
-    in_front, behind = _open_air_off(rays, point, normal), _open_air_off(rays, point, -normal)
+    in_front, behind = (_open_air_off(rays, point, side) & (_rooms_off(point, side, rooms) == ROOM_OUTDOORS) for side in (normal, -normal))
     normal = np.where(in_front[:, None], normal, -normal)
     found = np.flatnonzero(in_front | behind)[:count]
     return point[found], normal[found]
@@ -158,9 +162,14 @@ def points_in_rooms(geometry: Geometry, rooms: tuple[Room, ...], count: int, rng
     for room in rooms:
         may |= ((high >= np.array(room.minimum) - EDGE_M) & (low <= np.array(room.maximum) + EDGE_M)).all(axis=1)
     point, normal = _drawn_on(corners[may], 16 * count, rng)
-    sides = [rooms_of(point + sign * IN_ROOM_M * normal, rooms) != ROOM_OUTDOORS for sign in (1, -1)]
+    sides = [_rooms_off(point, side, rooms) != ROOM_OUTDOORS for side in (normal, -normal)]
     found = np.flatnonzero(sides[0] | sides[1])[:count]
     return point[found], np.where(sides[0][found, None], normal[found], -normal[found])
+
+
+def _rooms_off(point: Float64, normal: Float64, rooms: tuple[Room, ...]) -> UInt16:
+    """(n,): the rooms right in front of surfaces."""
+    return rooms_of(point + IN_ROOM_M * normal, rooms)
 
 
 def _drawn_on(corners: Float64, count: int, rng: np.random.Generator) -> tuple[Float64, Float64]:
