@@ -15,6 +15,7 @@ from gi_core.error_report import expected_error
 from gi_core.grid import SectorIndex
 from gi_core.lighting import Lighting
 from server.finished_replies import FinishedReplies
+from server.heap import keeping_memory
 from server.live import Live
 from server.player_streams import PlayerStreams
 from server.player_volumes import PlayerVolumes
@@ -73,7 +74,7 @@ class Service:
     @contextmanager
     def preview_turn(self) -> Iterator[None]:
         """The right to draw one picture."""
-        with self._preview_lock:
+        with self._preview_lock, keeping_memory():
             yield
 
     def lighting(self, time: str, weather: str) -> Lighting:
