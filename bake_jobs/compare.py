@@ -166,7 +166,9 @@ def compare_dataset(
 
     for number, index in enumerate(chosen):
         points = points_of(tracer, dataset, index, points_per_sector, seed)
-        in_rooms = points_in_rooms(dataset.geometry(index), world.rooms, points_per_sector, sector_rng(seed, index, _IN_ROOMS))
+        in_rooms = None
+        if world.rooms:
+            in_rooms = points_in_rooms(dataset.geometry(index), world.rooms, points_per_sector, sector_rng(seed, index, _IN_ROOMS))
         for place, (state, lighting) in enumerate(lightings.items()):
             volume = engine.volume(points.eye, lighting)
             if place == 0:
@@ -186,7 +188,7 @@ def compare_dataset(
             _compare_surfaces(on_surfaces, served, points, reference, truth)
             if world.has_fine_voxels:
                 stages["shaded_fine"].add(_fine_light(engine, lighting, points), truth)
-            if len(in_rooms[0]):
+            if in_rooms is not None and len(in_rooms[0]):
                 truth = reference.surfaces(*in_rooms)
                 for stage, basis in zip(ROOM_STAGES, bases, strict=False):
                     light = ServedLight.of(engine, lighting, Look(distant="off"), points.eye, basis=basis)

@@ -12,7 +12,7 @@ import queue
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -215,13 +215,7 @@ class Ticker:
 
     def _next_command(self, number: int) -> _Coming | None:
         """What the next command that can be carried out makes of the state; None when there is none."""
-        while True:
-            try:
-                command, done = self._commands.get_nowait()
-            except queue.Empty:
-                return None
-            if not done.set_running_or_notify_cancel():
-                continue  # whoever asked has gone, and a future that was cancelled takes no answer
+        for command, done in self._asked():
             before = self.state
             try:
                 after = command(before, number)
@@ -231,6 +225,17 @@ class Ticker:
                 done.set_exception(error)
                 continue
             return _Coming(after, done, self._track_of(after) if is_unforeseen else None)
+        return None
+
+    def _asked(self) -> Iterator[tuple[Command, Future[Applied]]]:
+        """The commands that are there, in order, each to be answered by whoever takes it."""
+        while True:
+            try:
+                command, done = self._commands.get_nowait()
+            except queue.Empty:
+                return
+            if done.set_running_or_notify_cancel():  # else whoever asked has gone, and a future that was cancelled takes no answer
+                yield command, done
 
     def _track_of(self, state: LiveState) -> LightTrack:
         return LightTrack(self.world.dataset.world.location, self._worker, state.weather.at, self._sky)
@@ -288,13 +293,7 @@ class Ticker:
         return LiveLight(gained, given, LightVector.of(given), static, dynamic, settings, standing)
 
     def _refuse_commands(self) -> None:
-        while True:
-            try:
-                _, done = self._commands.get_nowait()
-            except queue.Empty:
-                return
-            if not done.set_running_or_notify_cancel():
-                continue
+        for _, done in self._asked():
             done.set_exception(self._stopped())
 
     def _stopped(self) -> LiveUnavailableError:
