@@ -22,6 +22,7 @@ from gi_core.recycled import RecycledArrays
 from gi_core.volume import SectorBox, box_mask, box_record, box_slices, nearest_columns, plan_boxes
 
 _COLUMNS = VOLUME_SHAPE[1] * VOLUME_SHAPE[2]
+_OWN_COLUMNS = np.arange(_COLUMNS).reshape(VOLUME_SHAPE[1:])
 # Light of a sector to show at this tick, on the device.
 ShownCubes = Callable[[LiveSector], cl.Buffer]
 
@@ -50,16 +51,17 @@ class _Layout:
 
     first : (3,) where it stands; present : sectors that are there
     boxes : parts that they fill, each with the parts of it that the layout before did not have; mask : all classes
-    placeholders : sectors of the world that are not there, with the columns (z, x) that stand for each
-    outside : columns (z, x) without a sector, and for each the column that it copies
+    placeholders : sectors of the world that are not there, each with the columns (n,), z * width + x, that show its placeholder
+    gathered : (layers * columns,) the place on the rings of each column of each layer; None where all are in the rings' own order. Columns
+        without a sector show the nearest that has one
     """
 
     first: Int64
     present: frozenset[SectorIndex]
     boxes: tuple[tuple[SectorBox, Sequence[SectorBox]], ...]
     mask: UInt8
-    placeholders: tuple[tuple[SectorIndex, slice, slice], ...]
-    outside: tuple[Int64, Int64] | None
+    placeholders: tuple[tuple[SectorIndex, Int64], ...]
+    gathered: Int64 | None
 
 
 class LiveVolume:
@@ -116,14 +118,11 @@ class LiveVolume:
         assert layout is not None
         values = self._arrays.take()
         self._read(values)
-        for index, z, x in layout.placeholders:
-            values[:, :, z, x] = (from_axes(self.basis) @ placeholder(index))[:, None, None, None]
-        if layout.outside is not None:
-            lack, nearest = layout.outside
-            values[:, :, lack[:, 0], lack[:, 1]] = values[:, :, nearest[:, 0], nearest[:, 1]]
+        for index, columns in layout.placeholders:
+            values.reshape(*values.shape[:2], _COLUMNS, 3)[:, :, columns] = (from_axes(self.basis) @ placeholder(index))[:, None, None]
         values.setflags(write=False)
         self._filled_at = tick
-        missing = tuple(index for index, _, _ in layout.placeholders)
+        missing = tuple(index for index, _ in layout.placeholders)
         self.published = PublishedVolume(values, layout.mask, layout.first, tick, tuple(sorted(layout.present)), missing, self.basis)
         return self.published
 
@@ -132,11 +131,15 @@ class LiveVolume:
         assert self._layout is not None
         assert self._rings is not None
         (rings, filled), self._rings = self._rings, None
-        first_x, first_y, first_z = self._layout.first.tolist()
-        level, at = first_y % VOLUME_SHAPE[0], _on_ring(first_x, first_z)
-        rolled = values.reshape(rings.shape)
+        level, at = _ring_start(self._layout.first)
+        rolled, gathered = values.reshape(rings.shape), self._layout.gathered
         filled.wait()
         with rings.base:
+            if gathered is not None:
+                flat = (len(rings), -1, 3)
+                # Clipped, though nothing is out of bounds: else NumPy gathers into an array of its own.
+                np.take(rings.reshape(flat), gathered, axis=1, out=rolled.reshape(flat), mode="clip")
+                return
             for to, of in (
                 (slice(0, VOLUME_SHAPE[0] - level), slice(level, None)),
                 (slice(VOLUME_SHAPE[0] - level, None), slice(0, level)),
@@ -173,6 +176,12 @@ def _on_ring(x: int, z: int) -> int:
     return (z * VOLUME_SHAPE[2] + x) % _COLUMNS
 
 
+def _ring_start(first: Int64) -> tuple[int, int]:
+    """The places on their rings of the first layer, and of its first column, of a volume whose voxel (0, 0, 0) is at (3,)."""
+    x, y, z = first.tolist()
+    return y % VOLUME_SHAPE[0], _on_ring(x, z)
+
+
 def volume_arrays(basis: str) -> RecycledArrays:
     """What volumes in a basis are read into."""
     return RecycledArrays((BASIS_SIZES[basis], *VOLUME_SHAPE, 3))
@@ -206,11 +215,24 @@ def _lay_out(
         else:
             mask[slices] = VOXEL_NO_SECTOR
             if box.index in known:
-                placeholders.append((box.index, *slices[1:]))
+                placeholders.append((box.index, slices[1:]))
                 has_light[slices[1:]] = True
     mask.setflags(write=False)
-    outside = None if has_light.all() or not has_light.any() else nearest_columns(has_light)
-    return _Layout(first, present, tuple(boxes), mask, tuple(placeholders), outside)
+    shown, gathered = _OWN_COLUMNS, None
+    if not has_light.all() and has_light.any():
+        lack, nearest = nearest_columns(has_light)
+        shown = shown.copy()
+        shown[tuple(lack.T)] = _OWN_COLUMNS[tuple(nearest.T)]
+        gathered = _on_rings(shown.reshape(-1), first)
+    columns = tuple((index, np.flatnonzero(np.isin(shown, _OWN_COLUMNS[part]))) for index, part in placeholders)
+    return _Layout(first, present, tuple(boxes), mask, columns, gathered)
+
+
+def _on_rings(columns: Int64, first: Int64) -> Int64:
+    """(layers * n,) places on the rings of columns (n,), z * width + x, in each layer of a volume whose voxel (0, 0, 0) is at (3,)."""
+    level, at = _ring_start(first)
+    layers = (np.arange(VOLUME_SHAPE[0]) + level) % VOLUME_SHAPE[0]
+    return (layers[:, None] * _COLUMNS + (columns + at) % _COLUMNS).reshape(-1)
 
 
 def _copy_moved(source: UInt8, target: UInt8, step: Int64) -> None:
