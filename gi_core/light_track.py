@@ -48,13 +48,23 @@ class LightTrack:
         self._blended: dict[tuple[int, int], Lighting] = {}
         """By step and part of it: of the moments that were asked for last."""
 
-    def is_ready(self, moment: datetime, rate: float) -> bool:
-        """Whether ``at`` would not wait for the same; what it lacks is made from now on."""
+    def has(self, moment: datetime, rate: float) -> bool:
+        """Whether ``at`` would not wait for the same; nothing is made."""
         if rate == 0:
-            return self._have_standing(moment).done()
-        here = self._step_of(moment, rate)
-        self._have_made(here, here + 1)
-        return self._made[here].done() and self._made[here + 1].done()
+            return self._standing is not None and self._standing[0] == moment.astimezone(UTC) and self._standing[1].done()
+        if _step_s(rate) != self._step_s or moment < self._begin:
+            return False
+        here = self._number_of(moment)
+        return all(number in self._made and self._made[number].done() for number in (here, here + 1))
+
+    def is_ready(self, moment: datetime, rate: float) -> bool:
+        """As ``has``; what it lacks is made from now on, in place of what another rate or an earlier moment asks for."""
+        if rate == 0:
+            self._have_standing(moment)
+        else:
+            here = self._step_of(moment, rate)
+            self._have_made(here, here + 1)
+        return self.has(moment, rate)
 
     def at(self, moment: datetime, rate: float) -> Lighting:
         """The light at an aware moment while the clock runs at ``rate`` x real time (0: it stands).
@@ -86,12 +96,16 @@ class LightTrack:
 
     def _step_of(self, moment: datetime, rate: float) -> int:
         """The step that a moment is in. Where the rate asks for steps of another length, or the moment is before all, they begin anew."""
-        step_s = max(SHORTEST_STEP_S, 2.0 ** math.ceil(math.log2(max(rate * STEP_REAL_S, 1.0))))
+        step_s = _step_s(rate)
         if step_s != self._step_s or moment < self._begin:
             self._step_s, self._begin = step_s, moment.astimezone(UTC)
             self._made.clear()
             self._blended.clear()
-        return math.floor((moment - _EPOCH).total_seconds() / step_s)
+        return self._number_of(moment)
+
+    def _number_of(self, moment: datetime) -> int:
+        """Of the step that a moment is in."""
+        return math.floor((moment - _EPOCH).total_seconds() / self._step_s)
 
     def _moment_of(self, number: int) -> datetime:
         """When a step begins."""
@@ -113,3 +127,8 @@ class LightTrack:
         lighting = make_lighting(self._location, moment, self._weather_at(moment), keep)
         with_sky = lighting_with_sky if keep else lighting_with_sky.__wrapped__
         return lighting if self._sky is None else with_sky(lighting, self._sky)
+
+
+def _step_s(rate: float) -> float:
+    """How long a step of a clock that runs at a rate is [s]."""
+    return max(SHORTEST_STEP_S, 2.0 ** math.ceil(math.log2(max(rate * STEP_REAL_S, 1.0))))

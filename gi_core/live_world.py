@@ -202,9 +202,9 @@ class LiveWorld:
         """A thread for work that gives way to ticks."""
         return background_thread(name, self._right_of_way)
 
-    def warm_up(self) -> None:
-        """Compile and run every kernel that light may ask for, on the dataset's smallest lit sector: a first run takes seconds, later
-        ones find PoCL's cache. Raises what reading that sector raises."""
+    def warm_up(self, is_stopped: Callable[[], bool] = lambda: False) -> None:
+        """Compile and run every kernel that light may ask for, on the dataset's smallest lit sector: a first run takes a dozen seconds,
+        later ones find PoCL's cache. Given up between two kernels when ``is_stopped``. Raises what reading that sector raises."""
         world = self.dataset.world
         lit = [index for index, facts in world.sectors.items() if facts.probes and facts.bricks]
         if not lit:
@@ -215,6 +215,8 @@ class LiveWorld:
         lamps = _lit_by_a_lamp(self._device, read, world.sectors)
         samples = self._device.allocate(sector.resident.sector.surfel_count + 8)
         for lights, snow, shining, sun_map in product(range(MAX_DIRECTIONAL_LIGHTS + 1), (0.0, 0.5), (None, lamps.buffer), (None, samples)):
+            if is_stopped():
+                return
             sector.resident.set_lamps(shining)
             sector.resident.set_sun_sample(sun_map)
             dark = np.zeros(lights, DIRECTIONAL_LIGHT.dtype)

@@ -48,11 +48,23 @@ Listener = Callable[[TickReport], None]
 
 @dataclass(frozen=True, eq=False)
 class _Coming:
-    """A state that is applied as soon as its light has been made: its track, None where that is the present one."""
+    """A state that is applied as soon as its light has been made.
+
+    track : of that light, None where the present one has it
+    keeps_moment : whether its clock then shows what it was asked for, however late: it was set, or stands; else it goes on from the present
+    """
 
     state: LiveState
     done: Future[Applied]
     track: LightTrack | None
+    keeps_moment: bool
+
+    def clock_at(self, number: int, present: WorldClock) -> WorldClock:
+        """Its clock, should it be applied at a tick in place of the present one."""
+        clock = self.state.clock
+        if self.track is None:
+            return clock
+        return replace(clock, start_tick=number) if self.keeps_moment else present.going_on_as(clock, number)
 
 
 class Ticker:
@@ -118,7 +130,7 @@ class Ticker:
         self.world.close()
 
     def apply(self, command: Command) -> Future[Applied]:
-        """Have a command applied before the next tick, or where it asks for another weather or time, the one that has light for it; none
+        """Have a command applied before the next tick, or where it asks for light that was not foreseen, the one that has it; none
         overtakes another. The future tells of that tick, or raises what the command raised."""
         done: Future[Applied] = Future()
         self._commands.put((command, done))
@@ -134,7 +146,7 @@ class Ticker:
         """Whether the world can be run."""
         try:
             started = time.perf_counter()
-            self.world.warm_up()
+            self.world.warm_up(self._stop.is_set)
             self._lighting_at(0)
             # What start-up made stays: looking through it for garbage again and again would stop ticks for tens of milliseconds.
             gc.collect()
@@ -201,14 +213,15 @@ class Ticker:
             if self._coming is None:
                 self._coming = self._next_command(number)
             coming = self._coming
-            if coming is None or not (coming.track is None or coming.track.is_ready(*shown_by(coming.state.clock, number))):
+            if coming is None:
                 return
-            self._coming = None
-            after = coming.state
+            clock = coming.clock_at(number, self.state.clock)
             if coming.track is not None:
+                if not coming.track.is_ready(*shown_by(clock, number)):
+                    return
                 self._track = coming.track
-                if is_elsewhere(after.clock, self.state.clock, number):  # at the time it asked for when it is seen to
-                    after = replace(after, clock=replace(after.clock, start_tick=number))
+            self._coming = None
+            after = coming.state if clock is coming.state.clock else replace(coming.state, clock=clock)
             self._note_changes(self.state, after)
             self.state = after
             coming.done.set_result(Applied(number, after))
@@ -219,12 +232,15 @@ class Ticker:
             before = self.state
             try:
                 after = command(before, number)
+                moment, rate = shown_by(after.clock, number)
                 # A new haze takes as long as ten ticks.
-                is_unforeseen = after.weather is not before.weather or is_elsewhere(after.clock, before.clock, number)
+                is_unforeseen = after.clock is not before.clock and not self._track.has(moment, rate)
+                is_unforeseen |= after.weather is not before.weather
+                keeps_moment = rate == 0 or moment != shown_by(before.clock, number)[0]
             except Exception as error:
                 done.set_exception(error)
                 continue
-            return _Coming(after, done, self._track_of(after) if is_unforeseen else None)
+            return _Coming(after, done, self._track_of(after) if is_unforeseen else None, keeps_moment)
         return None
 
     def _asked(self) -> Iterator[tuple[Command, Future[Applied]]]:
@@ -317,11 +333,6 @@ def lamps_now(
         return was if found == was else found
 
     return group(False, before[0]), group(True, before[1])
-
-
-def is_elsewhere(clock: WorldClock, other: WorldClock, number: int) -> bool:
-    """Whether two clocks show different moments at a tick."""
-    return shown_by(clock, number)[0] != shown_by(other, number)[0]
 
 
 def players_at(players: Mapping[str, LivePlayer], number: int, rate_hz: int) -> TickPlayers:

@@ -78,6 +78,11 @@ class WorldClock:
         """The clock that stands still, or goes on, from ``tick`` on."""
         return replace(self._from(tick), paused=paused)
 
+    def going_on_as(self, other: "WorldClock", tick: int) -> "WorldClock":
+        """The clock that goes on from what it shows at ``tick``, or at its last, as another one runs or stands."""
+        tick = tick if self.last_tick is None else min(tick, self.last_tick)
+        return replace(self._from(tick), rate_millionths=other.rate_millionths, paused=other.paused)
+
     def jumped(self, tick: int, text: str, location: Location) -> "WorldClock":
         """The clock that shows another moment at ``tick``, at the same rate.
 

@@ -128,6 +128,18 @@ def test_warming_up_changes_no_light(world, engine):
     np.testing.assert_array_equal(found, engine.volume(STREET, lighting).values)
 
 
+def test_warming_up_is_given_up_between_two_kernels(world):
+    """A server that is told to stop while it compiles would else be killed before it has ended."""
+    already = world._device.built_kernels
+    asked = count(1)
+    world.warm_up(lambda: next(asked) == 3)
+    assert next(asked) == 4, "it asked no more"
+    assert world._device.built_kernels > already
+    given_up = world._device.built_kernels
+    world.warm_up()
+    assert world._device.built_kernels > given_up
+
+
 def test_no_tick_builds_a_kernel_once_warm(engine):
     dataset = Dataset.open(GOLDEN)
     world = LiveWorld(dataset)

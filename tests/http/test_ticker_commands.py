@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import replace
-from datetime import datetime
+from datetime import datetime, timedelta
 from types import MappingProxyType, SimpleNamespace
 
 import pytest
@@ -137,6 +137,40 @@ def test_a_clock_that_is_set_shows_that_time_when_its_light_is_there(ticker: Tic
     assert applied.tick == number
     assert applied.state.clock.moment_at(number).strftime("%H:%M:%S.%f") == "13:00:00.000000"
     assert applied.state.clock.moment_at(number + 30).strftime("%H:%M:%S") == "13:01:00"
+
+
+def test_a_clock_that_runs_faster_waits_for_its_light_and_goes_on_from_the_present(ticker: Ticker) -> None:
+    """Snapshots of a faster clock are farther apart, and none is there yet. What the clock showed meanwhile, it showed at the old rate."""
+    ticker._lighting_at(0)
+    done = ticker.apply(lambda state, tick: state.with_clock(state.clock.with_rate(tick, 3600), is_jump=False))
+    number = ticks_until(ticker, done, 30)
+    assert number > 30, "its light cannot have been there"
+    clock = done.result(0).state.clock
+    noon = starting_clock(Location(), "12:00")
+    assert clock.moment_at(number) == noon.moment_at(number)
+    assert clock.moment_at(number + 30) - clock.moment_at(number) == timedelta(hours=1)
+    assert ticker._track.has(*shown_by(clock, number)), "no tick waits"
+
+
+def test_a_clock_that_stops_shows_the_moment_it_was_stopped_at(ticker: Ticker) -> None:
+    ticker._lighting_at(0)
+    done = ticker.apply(lambda state, tick: state.with_clock(state.clock.with_paused(tick, True), is_jump=False))
+    number = ticks_until(ticker, done, 30)
+    assert number > 30
+    assert {done.result(0).state.clock.moment_at(n) for n in (number, number + 99)} == {starting_clock(Location(), "12:00").moment_at(30)}
+    ticker._lighting_at(number)
+    goes_on = ticker.apply(lambda state, tick: state.with_clock(state.clock.with_paused(tick, False), is_jump=False))
+    number = ticks_until(ticker, goes_on, number + 1)
+    assert goes_on.result(0).state.clock.moment_at(number) == starting_clock(Location(), "12:00").moment_at(30)
+    assert ticker._track.has(*shown_by(ticker.state.clock, number)), "no tick waits"
+
+
+def test_a_clock_whose_light_is_there_runs_as_it_is_told_in_the_same_tick(ticker: Ticker) -> None:
+    """Up to 40 x a clock's snapshots are equally far apart."""
+    ticker._lighting_at(0)
+    done = ticker.apply(lambda state, tick: state.with_clock(state.clock.with_rate(tick, 20), is_jump=False))
+    ticker._apply_commands(1)
+    assert done.result(0).tick == 1
 
 
 def test_a_ticker_that_stops_refuses_what_waits_for_light(ticker: Ticker) -> None:

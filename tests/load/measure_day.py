@@ -1,6 +1,6 @@
 """A day of the live world, checked: midnight to midnight at a rate, the weather script on, players walking; prints a JSON report.
 
-    python tests/load/measure_day.py DATASET [--rate 60] [--players 3] [--hours 24] [--checks 20]
+    python tests/load/measure_day.py DATASET [--rate 60] [--players 3] [--hours 24] [--checks 20] [--budget-mb 512]
 
 At random ticks a player's published volume is compared with what a stateless query gives for that tick's very moment and weather: how
 far the live world is behind, as a share of the query's light. Exceptions, late ticks and memory are watched all the time.
@@ -20,6 +20,7 @@ from gi_core.dataset import Dataset
 from gi_core.engine import Engine
 from gi_core.errors import SectorlightError
 from gi_core.lighting_model import make_lighting
+from gi_core.live_world import DEFAULT_BUDGET_BYTES
 from gi_core.spectrum import LUMINANCE_FROM_RGB
 from server.cli_serve import SWITCH_INTERVAL_S
 from server.live import Live, LiveOptions
@@ -64,11 +65,12 @@ def main() -> int:
     parser.add_argument("--players", type=int, default=3)
     parser.add_argument("--hours", type=float, default=24.0, help="of the world's time")
     parser.add_argument("--checks", type=int, default=20)
+    parser.add_argument("--budget-mb", type=int, default=DEFAULT_BUDGET_BYTES >> 20, help="of resident sectors")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     sys.setswitchinterval(SWITCH_INTERVAL_S)  # as the server has it
     dataset = Dataset.open(options.dataset)
-    live, engine = Live(dataset, LiveOptions(start_time="00:00")), Engine(dataset)
+    live, engine = Live(dataset, LiveOptions(start_time="00:00", budget_bytes=options.budget_mb << 20)), Engine(dataset)
     ticker = live.ticker
     ticker.wait_until_running(120)
     script = scripted_weather(options.seed, dataset.world.location)
