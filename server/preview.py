@@ -9,7 +9,8 @@
 What a picture shows wrong is therefore wrong for clients as well.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -25,7 +26,7 @@ from server.camera import Camera
 from server.preview_air import background, plain_distance, through_fog
 from server.preview_fog import add_fog_light
 from server.preview_lamps import draw_lamps, lamp_irradiance
-from server.preview_occlusion import kept_by_decals, kept_share
+from server.preview_occlusion import kept_by_decals, kept_in_picture, kept_share
 from server.preview_scene import PreviewScene
 from server.raycast import RayCaster
 
@@ -56,7 +57,9 @@ def render(
     position, normal, triangle = surface.position[hit], surface.normal[hit], surface.triangle[hit]
     irradiance = direct_irradiance(scene.rays, lighting, lamps, position, normal)
     wanted = indirect_pixels(hit, camera.width, look.indirect)
-    irradiance[wanted] += indirect_irradiance(scene.rays, served, look, position[wanted], normal[wanted])
+    irradiance[wanted] += indirect_irradiance(
+        scene.rays, served, look, position[wanted], normal[wanted], partial(kept_in_picture, pixel=hit[wanted], width=camera.width)
+    )
     albedo = seen_albedo(scene, lighting, position, normal, triangle)
     radiance[hit] = albedo / np.pi * irradiance + scene.emission[triangle]
     radiance[hit] = through_fog(radiance[hit], surface.distance[hit], lighting)
@@ -93,9 +96,16 @@ def indirect_pixels(pixel: Int64, width: int, indirect: Indirect) -> Int64:
     return np.arange(len(pixel) if indirect == "on" else 0)
 
 
-def indirect_irradiance(rays: RayCaster, served: ServedLight, look: Look, position: Float64, normal: Float32) -> Float64:
-    """Indirect light (n, 3) [lx] on surface points (n, 3) [m] with normals (n, 3), as this look has it."""
+def indirect_irradiance(
+    rays: RayCaster,
+    served: ServedLight,
+    look: Look,
+    position: Float64,
+    normal: Float32,
+    kept: Callable[[RayCaster, Float64, Float32], Float32] = kept_share,
+) -> Float64:
+    """Indirect light (n, 3) [lx] on surface points (n, 3) [m] with normals (n, 3), as this look has it. ``kept``: what occlusion leaves."""
     light = served.irradiance(position, normal).astype(np.float64)
     if look.occlusion:
-        light *= (kept_share(rays, position, normal) * kept_by_decals(served.decals, position, normal))[:, None]
+        light *= (kept(rays, position, normal) * kept_by_decals(served.decals, position, normal))[:, None]
     return light

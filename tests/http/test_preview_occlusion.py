@@ -1,5 +1,7 @@
 """Ambient occlusion in a picture. Known answers, no city needed."""
 
+from collections.abc import Iterable
+
 import numpy as np
 import pytest
 
@@ -8,8 +10,9 @@ from gi_core.constants import VOLUME_SHAPE, VOXEL_SIZE_M
 from gi_core.decals import hidden_share
 from gi_core.grid import volume_first_voxel, voxel_centre
 from gi_core.world import Decal
+from server.camera import Camera
 from server.preview import indirect_irradiance
-from server.preview_occlusion import NEAR_ALBEDO, REACH_M, kept_by_decals, kept_share, sphere_lattice
+from server.preview_occlusion import NEAR_ALBEDO, RAYS, REACH_M, kept_by_decals, kept_in_picture, kept_share, sphere_lattice
 from server.raycast import RayCaster
 
 UP = np.array([[0.0, 1.0, 0.0]], np.float32)
@@ -42,6 +45,43 @@ def test_a_surface_counts_by_how_near_it_is() -> None:
     free = np.where(REACH_M * cosine > 1, 1 / (REACH_M * np.maximum(cosine, 1e-9)), 1.0).mean()
     kept = kept_share(lid, np.zeros((1, 3)), UP)[0]
     assert kept == pytest.approx(free / (1 - NEAR_ALBEDO * (1 - free)), abs=0.02)
+
+
+def test_pixels_that_share_rays_see_as_much_as_those_that_cast_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    rays = floor_and_wall(0.0)
+    camera = Camera(np.array([9.0, 4.0, -6.0]), np.array([0.0, 0.0, 3.0]), 75.0, 240)
+    seen = rays.first_surface(camera.eye, camera.rays())
+    pixel = np.flatnonzero(seen.hit)
+    position, normal = seen.position[pixel], seen.normal[pixel]
+    monkeypatch.setattr("server.preview_occlusion.RAYS", 512)
+    truth = kept_share(rays, position, normal)
+    monkeypatch.setattr("server.preview_occlusion.RAYS", RAYS)
+    alone = kept_share(rays, position, normal)
+    cast: list[int] = []
+    free_share = RayCaster.free_share
+
+    def counted(rays: RayCaster, position: np.ndarray, normal: np.ndarray, ways: Iterable[np.ndarray]) -> np.ndarray:
+        every = list(ways)
+        cast.append(len(position) * len(every))
+        return free_share(rays, position, normal, every)
+
+    monkeypatch.setattr(RayCaster, "free_share", counted)
+    shared = kept_in_picture(rays, position, normal, pixel, camera.width)
+    assert sum(cast) < 0.3 * RAYS * len(pixel)
+    assert truth.min() < 0.7 < 0.99 < truth.max()
+    errors = [np.sqrt(np.mean((found - truth) ** 2)) for found in (alone, shared)]
+    assert errors[1] < 1.5 * errors[0]
+    assert abs(np.mean(shared - alone)) < 0.0005
+
+
+def test_a_pixel_without_neighbours_in_its_plane_casts_all_rays_itself() -> None:
+    """Of a floor and a wall that touch in the picture; and what shows in one row alone."""
+    rays = floor_and_wall(0.0)
+    position = np.array([[0.5, 0.0, 0.0], [0.0, 0.5, 0.0], [0.5, 0.0, 1.0]])
+    normal = np.array([[0, 1, 0], [1, 0, 0], [0, 1, 0]], np.float32)
+    pixel = np.array([41, 42, 43])
+    np.testing.assert_array_equal(kept_in_picture(rays, position, normal, pixel, 40), kept_share(rays, position, normal))
+    assert kept_in_picture(rays, position[:0], normal[:0], pixel[:0], 40).shape == (0,)
 
 
 def test_the_lattice_is_even() -> None:
