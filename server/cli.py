@@ -20,6 +20,8 @@ from server.cli_serve_options import serve
 from server.version import program_version
 
 INTERRUPTED = 130  # 128 + SIGINT, what a shell expects
+# A bake of so many measures itself unless told otherwise.
+REPORTED_SECTORS = 100
 BENCH_SOURCE = "procedural:midtown?blocks=1x1&seed=1"
 
 app = typer.Typer(
@@ -120,6 +122,12 @@ def bake(
         float | None,
         typer.Option(help="Place probes until the bake's estimate of its error near surfaces is below, as in 0.04; at most 1000 a sector."),
     ] = None,
+    report: Annotated[
+        bool | None,
+        typer.Option(
+            help=f"Measure the bake against the path tracer when done, some ten seconds; unset: from {REPORTED_SECTORS} sectors on."
+        ),
+    ] = None,
 ) -> None:
     """Bake a city into a dataset. Interrupted with Ctrl-C, it keeps the sectors that are finished, and the same command bakes the rest."""
     chosen = None if sectors is None else parse_sectors(sectors)
@@ -127,11 +135,20 @@ def bake(
         from bake_jobs.runner import bake as run
 
         with writing(output):
-            run(source, output, quality, jobs, chosen, seed, restart, knobs=knob or (), target_error=target_error)
+            world = run(source, output, quality, jobs, chosen, seed, restart, knobs=knob or (), target_error=target_error)
     except KeyboardInterrupt:
         kept = sum(1 for _ in output.glob("sectors/*.gisec"))
         again = " (without --restart)" if restart else ""
         fail(f"interrupted; {output} holds {kept} finished sectors, and the same command{again} bakes the rest", INTERRUPTED)
+    with_probes = sum(1 for facts in world.sectors.values() if facts.probes)
+    wanted = with_probes >= REPORTED_SECTORS if report is None else report and with_probes > 0
+    if wanted and world.error_report is None:
+        try:
+            from bake_jobs.cli_compare import report_bake
+
+            report_bake(output, source if chosen else None)
+        except KeyboardInterrupt:
+            fail(f"interrupted; {output} is whole, and `sectorlight compare {output}` measures it", INTERRUPTED)
 
 
 @app.command(context_settings={"ignore_unknown_options": True})  # -1,0 is a sector

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from bake_jobs import cli_compare
 from bake_jobs.cli_compare import sectors_of, split_states
 from bake_jobs.compare import STAGES
 from gi_core import sector_file
@@ -18,9 +19,11 @@ from gi_core.dataset import Dataset, write_world
 from gi_core.engine import Engine
 from gi_core.errors import InputError
 from gi_core.grid import SectorIndex
+from server import cli
 
 RunCommand = Callable[..., Any]
 SOURCE = "procedural:midtown?blocks=1x1&seed=1"
+PART = ("--sectors=0:1,0:1",)
 SMALL = ("--sectors", "1", "--points", "3", "--samples", "16")
 
 
@@ -49,6 +52,26 @@ def test_it_prints_a_table_and_writes_json_and_a_chart(sectorlight: RunCommand, 
     assert {path: path.stat().st_mtime_ns for path in part.rglob("*")} == before
     assert "the report was not stored: sector" in done.stderr
     assert "name its --source" in done.stderr
+
+
+def test_a_bake_of_many_sectors_measures_itself_once(sectorlight: RunCommand, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cli_compare, "BAKE_POINTS", 3)
+    monkeypatch.setattr(cli_compare, "BAKE_SAMPLES", 16)
+    monkeypatch.setattr(cli, "REPORTED_SECTORS", 2)
+    few, many = (("bake", SOURCE, "-o", str(tmp_path / name), "--quality", "draft", *more) for name, *more in (("a", *PART), ("b",)))
+    assert sectorlight(*few).returncode == 0
+    assert Dataset.open(tmp_path / "a").world.error_report is None
+    # What surrounds one of two sectors comes from the source.
+    for command in ((*few, "--report"), many):
+        done = sectorlight(*command)
+        assert done.returncode == 0, done.stderr
+        assert "Errors beside the path tracer, 3 points of each of" in done.stderr
+        report = Dataset.open(Path(command[3])).world.error_report
+        assert report is not None
+        assert (list(report["states"]), report["samples"]) == (["noon", "overcast"], 16)
+    assert "Errors beside" not in sectorlight(*many).stderr, "it is there already"
+    assert sectorlight(*many, "--restart", "--no-report").returncode == 0
+    assert Dataset.open(tmp_path / "b").world.error_report is None
 
 
 def test_the_report_stays_in_the_dataset_and_is_quoted(sectorlight: RunCommand, city: Path, tmp_path: Path) -> None:

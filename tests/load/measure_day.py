@@ -3,26 +3,33 @@
     python tests/load/measure_day.py DATASET [--rate 60] [--players 3] [--hours 24] [--checks 20] [--budget-mb 512]
 
 At random ticks a player's published volume is compared with what a stateless query gives for that tick's very moment and weather: how
-far the live world is behind, as a share of the query's light. Exceptions, late ticks and memory are watched all the time.
+far the live world is behind, as a share of the query's light. Queries are another process's: the memory that is told of is the live
+world's. Exceptions, late ticks and memory are watched all the time.
 """
 
 import argparse
 import json
+import multiprocessing
 import random
 import sys
 import time
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from datetime import datetime
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
 from gi_core.dataset import Dataset
 from gi_core.engine import Engine
-from gi_core.errors import SectorlightError
 from gi_core.lighting_model import make_lighting
+from gi_core.live_volume import PublishedVolume
 from gi_core.live_world import DEFAULT_BUDGET_BYTES
 from gi_core.spectrum import LUMINANCE_FROM_RGB
+from gi_core.weather import Weather
 from server.cli_serve import SWITCH_INTERVAL_S
+from server.heap import give_memory_back
 from server.live import Live, LiveOptions
 from server.live_weather import scripted_weather
 from server.players import Player
@@ -33,13 +40,17 @@ def luminance(values: np.ndarray) -> np.ndarray:
     return values @ LUMINANCE_FROM_RGB.astype(np.float32)
 
 
-def staleness(live: Live, engine: Engine, name: str) -> dict[str, float | str]:
-    """How far a player's volume is from the query at the tick that it was filled in."""
-    ticker = live.ticker
-    published = ticker.world.volumes.of_player[name].published
-    moment = ticker.state.clock.moment_at(ticker.tick)
-    weather = ticker.state.weather.at(moment)
-    query = engine.volume(published_centre(published.first_voxel), make_lighting(live.dataset.world.location, moment, weather))
+@lru_cache(maxsize=1)
+def engine_of(dataset: Path) -> Engine:
+    """A process's engine."""
+    return Engine(Dataset.open(dataset))
+
+
+def staleness(dataset: Path, published: PublishedVolume, moment: datetime, weather: Weather) -> dict[str, float | str]:
+    """How far a player's volume is from the query at the moment that it was filled for."""
+    engine = engine_of(dataset)
+    lighting = make_lighting(engine.dataset.world.location, moment, weather)
+    query = engine.volume(published_centre(published.first_voxel), lighting)
     air = (query.mask == 1) | (query.mask == 2)
     seen, truth = luminance(published.values)[:, air], luminance(query.values)[:, air]
     error = np.abs(seen - truth) / np.maximum(truth, 0.02 * truth.mean())
@@ -68,9 +79,11 @@ def main() -> int:
     parser.add_argument("--budget-mb", type=int, default=DEFAULT_BUDGET_BYTES >> 20, help="of resident sectors")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
-    sys.setswitchinterval(SWITCH_INTERVAL_S)  # as the server has it
+    # As the server has them.
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
+    give_memory_back()
     dataset = Dataset.open(options.dataset)
-    live, engine = Live(dataset, LiveOptions(start_time="00:00", budget_bytes=options.budget_mb << 20)), Engine(dataset)
+    live = Live(dataset, LiveOptions(start_time="00:00", budget_bytes=options.budget_mb << 20))
     ticker = live.ticker
     ticker.wait_until_running(120)
     script = scripted_weather(options.seed, dataset.world.location)
@@ -83,6 +96,8 @@ def main() -> int:
     seconds = options.hours * 3600 / options.rate
     rng = random.Random(options.seed)
     due = sorted(rng.uniform(0, seconds) for _ in range(options.checks))
+    queries = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"))
+    queries.submit(engine_of, options.dataset)
     started, checks, memory = time.monotonic(), [], []
     while time.monotonic() - started < seconds:
         now = time.monotonic() - started
@@ -90,12 +105,13 @@ def main() -> int:
             memory.append(round((memory_bytes() or 0) / 1e6, 1))
         if due and now >= due[0]:
             due.pop(0)
-            try:
-                checks.append(staleness(live, engine, f"p{rng.randrange(options.players)}"))
-                print(json.dumps(checks[-1]), file=sys.stderr)
-            except SectorlightError as error:
-                print(f"no check: {error}", file=sys.stderr)
+            state, tick = ticker.state, ticker.tick
+            moment = state.clock.moment_at(tick)
+            published = ticker.world.volumes.of_player[f"p{rng.randrange(options.players)}"].published
+            checks.append(queries.submit(staleness, options.dataset, published, moment, state.weather.at(moment)))
         time.sleep(0.2)
+    checks = [check.result() for check in checks]
+    queries.shutdown()
     stats = ticker.stats
     ticks = stats.ticks - first_ticks
     report = {
