@@ -2,8 +2,9 @@
 
     python -m bake_jobs.basis_study SOURCE X0:X1,Z0:Z1 [STATES]
 
-At points in the open air of some sectors, one set of paths gives exact irradiance on surfaces that face anywhere, and the coefficients
-of every basis; so what differs is the basis alone, and no noise. Beside the three that are baked:
+At points in the open air of some sectors, one set of paths gives exact irradiance on surfaces that face anywhere, and as the sector's own
+do, and the coefficients of every basis; so what differs is the basis alone, and no noise. Its price is told as the bytes of a volume in
+halves, and as the time that NumPy takes to read it at a thousand points. Beside the three that are baked:
 
     cube, least squares   faces that fit irradiance over all normals best, instead of being it along the axes
     sh1, linear           without what ZH3 adds
@@ -12,6 +13,7 @@ of every basis; so what differs is the basis alone, and no noise. Beside the thr
 """
 
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -24,17 +26,21 @@ from bake_jobs.config import settings_for
 from bake_jobs.inside import Solids
 from bake_jobs.path_tracer import PathTracer
 from bake_jobs.placement import place_probes
+from bake_jobs.scene import Scene
 from bake_jobs.scene_source import load_scene
 from gi_core.ambient_cube import basis_weights
 from gi_core.arrays import AnyArray, Float32, Float64
 from gi_core.basis import evaluate, evaluation_weights, projection_weights
+from gi_core.constants import SECTOR_SIZE_M, VOLUME_SHAPE
 from gi_core.error_report import DARKEST_SHARE_OF_MEAN
 from gi_core.grid import SectorIndex
 from gi_core.lighting_model import make_lighting
 from gi_core.spectrum import LUMINANCE_FROM_RGB
 
 POINTS_PER_SECTOR = 40
-NORMALS = 96
+# Of surfaces that face anywhere, and of a sector's own.
+NORMALS, OWN_NORMALS = 96, 32
+TIMED_POINTS, TIMES = 20_000, 9
 SAMPLES = 4096
 DIAGONALS = np.array([[x, y, z] for x in (1, -1) for y in (1, -1) for z in (1, -1)], np.float64) / np.sqrt(3)
 
@@ -90,21 +96,41 @@ STUDIES = {
 }
 
 
-def errors(source: str, sectors: list[SectorIndex], states: list[str]) -> dict[str, Float64]:
-    """Relative errors of luminance (e,) of each way, at all points, normals and states."""
+@dataclass(frozen=True, eq=False)
+class Errors:
+    """Relative errors of luminance, of all points and states: (e,) on surfaces that face anywhere, (o,) as the sector's own do."""
+
+    anywhere: Float64
+    own: Float64
+
+
+def own_normals(scene: Scene, index: SectorIndex) -> Float64:
+    """(OWN_NORMALS, 3) of triangles whose middle is in a sector, drawn by area; of all triangles where it has none."""
+    corners = scene.vertices[scene.triangles]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(cross, axis=1)
+    here = (np.floor(corners.mean(axis=1)[:, [0, 2]] / SECTOR_SIZE_M) == np.array(index)).all(axis=1)
+    weight = np.where(here, area, 0) if area[here].sum() > 0 else area
+    chosen = np.random.default_rng(0).choice(len(area), OWN_NORMALS, p=weight / weight.sum())
+    return np.asarray(cross[chosen] / area[chosen, None])
+
+
+def errors(source: str, sectors: list[SectorIndex], states: list[str]) -> dict[str, Errors]:
+    """Errors of each way to hold irradiance."""
     scene, settings = load_scene(source), settings_for("talk")
     tracer = PathTracer(scene.vertices, scene.triangles, scene.albedo, scene.emission)
-    solids, normals = Solids(scene.vertices, scene.triangles), spiral(NORMALS)
-    found: dict[str, list[Float64]] = {name: [] for name in STUDIES}
+    solids = Solids(scene.vertices, scene.triangles)
+    found: dict[str, list[tuple[Float64, Float64]]] = {name: [] for name in STUDIES}
     for index in sectors:
+        normals = np.concatenate([spiral(NORMALS), own_normals(scene, index)])
         placed = place_probes(tracer.rays, solids, scene.bounds, index, settings, scene.rooms, scene.hints).position
         open_air = np.flatnonzero(look_around(tracer.rays, placed).open_air)
         points = placed[np.random.default_rng(0).permutation(open_air)[:POINTS_PER_SECTOR]]
         for state in parse_states(states, scene.location):
             lighting = make_lighting(scene.location, state.time, state.weather)
-            ends = np.cumsum([NORMALS, *(study.coefficients for study in STUDIES.values())])[:-1]
+            ends = np.cumsum([len(normals), *(study.coefficients for study in STUDIES.values())])[:-1]
 
-            def project(directions: Float32) -> AnyArray:
+            def project(directions: Float32, normals: Float64 = normals) -> AnyArray:
                 truth = np.maximum(directions @ normals.T.astype(np.float32), 0)
                 return np.concatenate([truth, *(study.project(directions) for study in STUDIES.values())], axis=1)
 
@@ -113,9 +139,22 @@ def errors(source: str, sectors: list[SectorIndex], states: list[str]) -> dict[s
             exact = truth @ LUMINANCE_FROM_RGB
             scale = np.maximum(exact, DARKEST_SHARE_OF_MEAN * exact.mean())
             for (name, study), coefficients in zip(STUDIES.items(), parts, strict=True):
-                rebuilt = study.rebuild(np.repeat(coefficients, NORMALS, axis=0), np.tile(normals, (len(points), 1)))
-                found[name].append((np.abs((rebuilt @ LUMINANCE_FROM_RGB).reshape(exact.shape) - exact) / scale).reshape(-1))
-    return {name: np.concatenate(parts) for name, parts in found.items()}
+                rebuilt = study.rebuild(np.repeat(coefficients, len(normals), axis=0), np.tile(normals, (len(points), 1)))
+                error = np.abs((rebuilt @ LUMINANCE_FROM_RGB).reshape(exact.shape) - exact) / scale
+                found[name].append((error[:, :NORMALS].reshape(-1), error[:, NORMALS:].reshape(-1)))
+    return {name: Errors(*(np.concatenate(kind) for kind in zip(*parts, strict=True))) for name, parts in found.items()}
+
+
+def microseconds(study: Study) -> float:
+    """What reading a thousand points takes, the median of several times."""
+    normals = spiral(TIMED_POINTS).astype(np.float32)
+    coefficients = np.ones((TIMED_POINTS, study.coefficients, 3), np.float32)
+    took = []
+    for _ in range(TIMES):
+        begun = time.perf_counter()
+        study.rebuild(coefficients, normals)
+        took.append(time.perf_counter() - begun)
+    return float(np.median(took)) * 1e6 / TIMED_POINTS * 1000
 
 
 def main() -> None:
@@ -123,9 +162,13 @@ def main() -> None:
     (x0, x1), (z0, z1) = ([int(n) for n in part.split(":")] for part in sys.argv[2].split(","))
     states = sys.argv[3].split(",") if len(sys.argv) > 3 else ["noon", "low_sun", "overcast"]
     table = errors(sys.argv[1], [SectorIndex(x, z) for x in range(x0, x1) for z in range(z0, z1)], states)
-    print("| basis | numbers a channel | median | p95 |\n|---|---|---|---|")
+    print("| basis | numbers a channel | kB a volume | a thousand points [us] | facing anywhere | as its own surfaces |")
+    print("|---|---|---|---|---|---|")
     for name, error in table.items():
-        print(f"| {name} | {STUDIES[name].coefficients} | {100 * np.median(error):.1f} % | {100 * np.quantile(error, 0.95):.0f} % |")
+        study = STUDIES[name]
+        kilobytes = 2 * 3 * study.coefficients * np.prod(VOLUME_SHAPE) / 1000
+        shown = [f"{100 * np.median(e):.1f} / {100 * np.quantile(e, 0.95):.0f} %" for e in (error.anywhere, error.own)]
+        print(f"| {name} | {study.coefficients} | {kilobytes:.0f} | {microseconds(study):.0f} | {' | '.join(shown)} |")
 
 
 if __name__ == "__main__":

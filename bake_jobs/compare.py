@@ -156,7 +156,7 @@ def compare_dataset(
     engine = Engine(dataset, device)
     engine.lamps = world.lamps if lamps is None else tuple(lamps)
     lightings = {state.name: engine.lighting(state.time, state.weather) for state in moments}
-    tracer = _tracer(dataset, chosen, scene)
+    tracer = dataset_tracer(dataset, chosen, scene)
     bases = (world.basis,) if world.basis == "cube" else (world.basis, "cube")
     all_stages = STAGES + (CUBE_STAGES if len(bases) > 1 else ()) + (FINE_STAGES if world.has_fine_voxels else ())
     all_stages += ROOM_STAGES[: len(bases)] if world.rooms else ()
@@ -236,7 +236,7 @@ def choose_sectors(dataset: Dataset, seed: int, count: int = DEFAULT_SECTORS) ->
     return [pool[i] for i in sorted(picks)]
 
 
-def _tracer(dataset: Dataset, chosen: Sequence[SectorIndex], scene: Scene | None) -> PathTracer:
+def dataset_tracer(dataset: Dataset, chosen: Sequence[SectorIndex], scene: Scene | None = None) -> PathTracer:
     """Over the scene, or over the dataset's triangles within reach of the chosen sectors."""
     if scene is not None:
         return PathTracer(scene.vertices, scene.triangles, scene.albedo, scene.emission)

@@ -2,8 +2,8 @@
 
     python -m gi_core.staleness_table DATASET X,Y,Z      a player who stands there; a table on stdout
 
-Ticks are stepped one after another, 30 to a second of the clock's real time, so a busy machine changes nothing. The shadow map is off: what
-is left between the two is time alone.
+Ticks are stepped one after another, 30 to a second of the clock's real time, so a busy machine changes nothing but what a tick takes. The
+shadow map is off: what is left between the two is time alone.
 """
 
 import argparse
@@ -51,6 +51,7 @@ class Row:
     """What moves, sectors relit in a tick, and the volume's error: median, 95th percentile and bias, of luminance, relative.
 
     changes : how far the converged light itself moves in a second, its median
+    tick_ms : what a tick that relights takes, the median; NaN where none did
     """
 
     moves: str
@@ -59,6 +60,7 @@ class Row:
     p95: float
     bias: float
     changes: float
+    tick_ms: float
 
 
 LampsAt = Callable[[int], tuple[Lamp, ...]]
@@ -120,7 +122,7 @@ def _measured(
 ) -> Row:
     player = TickPlayers(("one",), position[None], np.zeros((1, 3)))
     warm = settle(world, 0, player, live_light(world, track.at(begin, 0.0), lamps_at(0), standing=True))
-    errors, biases, before, changes = [], [], None, []
+    errors, biases, before, changes, took_ms = [], [], None, [], []
     due = set(np.linspace(RUN_TICKS // 2, RUN_TICKS - 1, CHECKS).astype(int).tolist())
     for step in range(RUN_TICKS):
         moment = begin + timedelta(seconds=rate * step / TICK_RATE_HZ)
@@ -128,7 +130,10 @@ def _measured(
         if lamps_at(step) != lamps_at(step - 1):
             world.lamps_moved([(np.array(lamp.position), lamp.range_m) for lamp in lamps_at(step)])
         if places > 1 or step % 2 == 0:
-            world.tick(warm + step, player, live_light(world, lighting, lamps_at(step), standing=False))
+            light = live_light(world, lighting, lamps_at(step), standing=False)
+            begun = time.perf_counter()
+            if world.tick(warm + step, player, light).relit:
+                took_ms.append((time.perf_counter() - begun) * 1e3)
         if step not in due:
             continue
         engine.lamps = lamps_at(step)
@@ -143,7 +148,8 @@ def _measured(
             changes.append(float(np.median(np.abs(truth - before[1]) / np.maximum(before[1], 1e-9))) / gone_s)
         before = step, truth
     found = np.concatenate(errors)
-    return Row(moves, places, float(np.median(found)), float(np.quantile(found, 0.95)), float(np.mean(biases)), float(np.median(changes)))
+    figures = (np.median(found), np.quantile(found, 0.95), np.mean(biases), np.median(changes), np.median(took_ms) if took_ms else np.nan)
+    return Row(moves, places, *(float(figure) for figure in figures))
 
 
 def settle(world: LiveWorld, tick: int, players: TickPlayers, light: LiveLight) -> int:
@@ -184,10 +190,10 @@ def main() -> None:
     parser.add_argument("position", help="X,Y,Z [m]")
     given = parser.parse_args()
     rows = staleness_table(Dataset.open(given.dataset), parse_position(given.position))
-    titles = ("what moves", "converged light moves by, in a second", "sectors a tick", "median", "95th percentile", "bias")
+    titles = ("what moves", "converged light moves by, in a second", "sectors a tick", "median", "95th percentile", "bias", "tick [ms]")
     print(f"| {' | '.join(titles)} |\n" + "|---" * len(titles) + "|")
     for row in rows:
-        figures = f"{row.median:.2%} | {row.p95:.2%} | {row.bias:+.2%}"
+        figures = f"{row.median:.2%} | {row.p95:.2%} | {row.bias:+.2%} | {row.tick_ms:.1f}"
         print(f"| {row.moves} | {row.changes:.2%} | {row.places} | {figures} |")
 
 

@@ -52,6 +52,15 @@ def serve(
     tick_rate: Annotated[
         int, typer.Option(envvar="SECTORLIGHT_TICK_RATE", min=1, max=240, help="Of the live world, in Hz: more is smoother and costs more.")
     ] = 30,
+    sectors_per_tick: Annotated[
+        int,
+        typer.Option(
+            envvar="SECTORLIGHT_SECTORS_PER_TICK",
+            min=2,
+            max=64,
+            help="That a tick of the live world relights at most: more follow lamps that flicker and clocks that race, and cost time.",
+        ),
+    ] = 2,
     time: Annotated[
         str, typer.Option(envvar="SECTORLIGHT_TIME", help="Where the live world's clock starts: 13:00, or ISO 8601 with a date.")
     ] = "12:00",
@@ -79,6 +88,7 @@ def serve(
         start_time=time,
         start_weather=weather,
         budget_bytes=budget_mb << 20,
+        places=sectors_per_tick,
         players_file=players,
         state_file=state,
         epw_file=epw,

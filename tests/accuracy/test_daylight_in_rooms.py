@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bake_jobs import room_voxel_study
 from bake_jobs.compare import compare_dataset
 from bake_jobs.compare_points import points_in_rooms
-from bake_jobs.compare_report import stored
+from bake_jobs.compare_report import stored, summarise
 from bake_jobs.config import settings_for
 from bake_jobs.room_search import world_rooms
 from gi_core.dataset import Dataset, write_world
@@ -68,6 +69,14 @@ def test_rooms_are_lit_as_the_path_tracer_says(report: dict[str, Any]) -> None:
         assert stages["shaded_rooms"]["p95"] < 0.8, state
         # What harmonics of the second order say of the six faces is what the cube has of them.
         assert stages["shaded_rooms_cube"]["median"] == pytest.approx(stages["shaded_rooms"]["median"], abs=0.05)
+
+
+def test_exact_light_in_finer_voxels_is_nearer_to_the_truth(city: Path) -> None:
+    found = room_voxel_study.study(Dataset.open(city), ["night"], sectors=1, points=60, samples=1024, cascades=(0, -2))["night"]
+    served, coarse, fine = (summarise(samples) for samples in found.values())
+    assert served["n"] == coarse["n"] == fine["n"] == 60
+    assert fine["median"] < coarse["median"]
+    assert fine["median"] < 0.08
 
 
 def test_what_interior_volumes_may_be_off_by_is_told(report: dict[str, Any], city: Path, tmp_path: Path) -> None:

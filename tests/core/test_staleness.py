@@ -32,6 +32,7 @@ def test_every_motion_is_swept_with_every_number_of_sectors(rows):
         (moves, places) for moves in ("clock, 1 x", "clock, 600 x", "8 lamps, 3 Hz") for places in (1, 2)
     ]
     assert all(np.isfinite([row.median, row.p95, row.bias, row.changes]).all() for row in rows)
+    assert all(row.tick_ms > 0 for row in rows if row.moves != "clock, 1 x")
 
 
 def test_a_day_at_its_own_pace_is_never_behind(rows):

@@ -213,7 +213,8 @@ def test_a_bad_option_is_one_clear_line(
 
 
 def test_options_out_of_range_are_refused(city: Path, sectorlight: Callable[..., Any]) -> None:
-    for options in (["--tick-rate", "0"], ["--tick-rate", "1000"], ["--budget-mb", "1"], ["--tick-rate", "fast"]):
+    ranges = {"--tick-rate": ("0", "1000", "fast"), "--budget-mb": ("1",), "--sectors-per-tick": ("1", "65")}
+    for options in ((name, value) for name, values in ranges.items() for value in values):
         assert sectorlight("serve", str(city), "--port", "0", *options).returncode == 2
 
 
