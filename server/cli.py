@@ -13,7 +13,7 @@ from typing import Annotated, NoReturn, cast
 
 import typer
 
-from gi_core.errors import FormatError, InputError, SectorlightError, SectorMissingError
+from gi_core.errors import FormatError, InputError, KernelBuildError, SectorlightError, SectorMissingError
 from server.cli_loadtest import loadtest
 from server.cli_options import DeviceOption
 from server.cli_serve_options import serve
@@ -143,12 +143,21 @@ def bake(
     with_probes = sum(1 for facts in world.sectors.values() if facts.probes)
     wanted = with_probes >= REPORTED_SECTORS if report is None else report and with_probes > 0
     if wanted and world.error_report is None:
-        try:
-            from bake_jobs.cli_compare import report_bake
+        _measure(output, source if chosen else None, is_asked=report is True)
 
-            report_bake(output, source if chosen else None)
-        except KeyboardInterrupt:
-            fail(f"interrupted; {output} is whole, and `sectorlight compare {output}` measures it", INTERRUPTED)
+
+def _measure(output: Path, source: str | None, is_asked: bool) -> None:
+    """Have a bake that is whole measured; where nobody asked for it a machine that cannot is told, and no failure."""
+    try:
+        from bake_jobs.cli_compare import report_bake
+
+        report_bake(output, source)
+    except KeyboardInterrupt:
+        fail(f"interrupted; {output} is whole, and `sectorlight compare {output}` measures it", INTERRUPTED)
+    except (InputError, KernelBuildError) as error:
+        if is_asked:
+            raise
+        print(f"sectorlight: {output} is whole, but was not measured: {error}", file=sys.stderr)
 
 
 @app.command(context_settings={"ignore_unknown_options": True})  # -1,0 is a sector

@@ -17,7 +17,7 @@ from bake_jobs.compare import STAGES
 from gi_core import sector_file
 from gi_core.dataset import Dataset, write_world
 from gi_core.engine import Engine
-from gi_core.errors import InputError
+from gi_core.errors import DeviceError, InputError
 from gi_core.grid import SectorIndex
 from server import cli
 
@@ -72,6 +72,17 @@ def test_a_bake_of_many_sectors_measures_itself_once(sectorlight: RunCommand, tm
     assert "Errors beside" not in sectorlight(*many).stderr, "it is there already"
     assert sectorlight(*many, "--restart", "--no-report").returncode == 0
     assert Dataset.open(tmp_path / "b").world.error_report is None
+
+    def without_a_device(*_: object, **__: object) -> None:
+        raise DeviceError("no OpenCL device")
+
+    monkeypatch.setattr(cli_compare, "compare_dataset", without_a_device)
+    done = sectorlight(*many)
+    assert (done.returncode, done.stderr.splitlines()[-1]) == (
+        0,
+        f"sectorlight: {tmp_path / 'b'} is whole, but was not measured: no OpenCL device",
+    )
+    assert sectorlight(*many, "--report").returncode == 2
 
 
 def test_the_report_stays_in_the_dataset_and_is_quoted(sectorlight: RunCommand, city: Path, tmp_path: Path) -> None:
