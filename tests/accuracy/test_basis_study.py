@@ -3,9 +3,19 @@
 import numpy as np
 import pytest
 
-from bake_jobs.basis_study import DIAGONALS, STUDIES, cube_least_squares, diagonal_weights, spiral
+from bake_jobs.basis_study import (
+    DIAGONALS,
+    OWN_NORMALS,
+    STUDIES,
+    cube_least_squares,
+    diagonal_weights,
+    microseconds,
+    own_normals,
+    spiral,
+)
 from gi_core.ambient_cube import basis_weights
 from gi_core.basis import conversion, evaluation_weights
+from gi_core.grid import SectorIndex
 
 DIRECTIONS = spiral(20_000)
 NORMALS = spiral(200)
@@ -35,3 +45,20 @@ def test_eight_vectors_blend_to_one_and_read_one_alone_nowhere():
     assert weights.min() >= 0
     # The diagonals are not orthogonal: along one of them its three neighbours count too.
     np.testing.assert_allclose(np.sort(diagonal_weights(DIAGONALS[:1])[0])[-4:], [1 / 12, 1 / 12, 1 / 12, 3 / 4], atol=1e-12)
+
+
+def test_a_sectors_own_surfaces_are_drawn_by_area(build):
+    """A floor in one sector, three thin walls in the next, whose ends are a hundredth of them."""
+    block = build().ground((0, 0), (60, 60))
+    for x in (70, 80, 90):
+        block.wall((x, 10), (x, 50), 30)
+    scene = block.scene()
+    floor, walls = (own_normals(scene, SectorIndex(x, 0)) for x in (0, 1))
+    np.testing.assert_allclose(np.abs(floor), [[0, 1, 0]] * OWN_NORMALS)
+    assert np.mean(np.abs(walls[:, 0]) == 1) > 0.9
+    np.testing.assert_allclose(np.linalg.norm(walls, axis=1), 1)
+    assert len(own_normals(scene, SectorIndex(9, 9))) == OWN_NORMALS, "of all, where a sector has none"
+
+
+def test_what_reading_takes_is_a_time():
+    assert microseconds(STUDIES["cube"]) > 0
