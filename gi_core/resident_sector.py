@@ -89,6 +89,8 @@ class ResidentSector:
         self._lamps_of: float | None = None
         self._bounces_of: float | None = None
         self._no_bounces: cl.Buffer | None = None
+        self._held: Float32 | None = None
+        """The very array that was written last, where it never changes and nothing was relit since."""
         self._is_lit_anew = True
 
     @property
@@ -172,6 +174,7 @@ class ResidentSector:
 
     def enqueue(self, queue: cl.CommandQueue, passes: int) -> None:
         """Enqueue passes, each one more bounce on the cubes that the sector holds. ``light`` comes first."""
+        self._held = None
         if self.sector.probe_count:
             self._run(queue, passes, self.bounce_starts, self.cubes)
 
@@ -231,11 +234,13 @@ class ResidentSector:
         return finish
 
     def write_cubes(self, cubes: Float32) -> None:
-        """Set the probes' cubes (P, B, 3) float32 [lx]: where the next pass takes its feedback from."""
-        if cubes.size:
+        """Set the probes' cubes (P, B, 3) float32 [lx]: where the next pass takes its feedback from. Read-only ones, which are taken never
+        to change, cost nothing while the sector holds them."""
+        if cubes.size and cubes is not self._held:
             padded = np.zeros((*cubes.shape[:2], 4), np.float32)
             padded[..., :3] = cubes
             cl.enqueue_copy(self.device.queue, self.cubes, padded)
+            self._held = None if cubes.flags.writeable else cubes
 
     def _find_brick_basis(self) -> cl.Buffer:
         """(N, B) float32, worked out on the device."""

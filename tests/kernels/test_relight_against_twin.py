@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gi_core import layout, pocl_cpu, relight, relight_twin
+from gi_core import layout, pocl_cpu, relight, relight_twin, resident_sector
 from gi_core.basis import convert
 from gi_core.constants import BASIS_SIZES
 from gi_core.device import Device, available_devices, choose_device, describe
@@ -196,6 +196,27 @@ def test_the_same_input_gives_the_same_bytes(device, make_sector):
     sector, given = make_sector(10), given_light(10, 2)
     runs = [Relighter(device).converge(ResidentSector(device, sector, PATCHES), given).cubes.tobytes() for _ in range(3)]
     assert runs[0] == runs[1] == runs[2]
+
+
+def test_cubes_that_never_change_are_written_once_until_something_is_relit(device, make_sector, monkeypatch):
+    resident = ResidentSector(device, make_sector(0), PATCHES)
+    light = np.ones((resident.sector.probe_count, 6, 3), np.float32)
+    copied = []
+    copy = resident_sector.cl.enqueue_copy
+    monkeypatch.setattr(resident_sector.cl, "enqueue_copy", lambda *given, **more: copied.append(given[1]) or copy(*given, **more))
+
+    def writes(cubes) -> int:
+        before = sum(target is resident.cubes for target in copied)
+        resident.write_cubes(cubes)
+        return sum(target is resident.cubes for target in copied) - before
+
+    assert (writes(light), writes(light)) == (1, 1), "an array that may change is read each time"
+    light.setflags(write=False)
+    assert (writes(light), writes(light)) == (1, 0)
+    Relighter(device).relight([resident], given_light(0, 1))
+    assert writes(light) == 1
+    np.testing.assert_array_equal(resident.read_cubes(), light)
+    assert (writes(2 * light), writes(light)) == (1, 1)
 
 
 def test_no_light_is_exactly_dark(device, make_sector):
