@@ -116,7 +116,7 @@ def in_words(numbers: Mapping[str, Any]) -> str:
     if not numbers["n"]:
         return ""
     low, high = (100 * end for end in numbers["median_ci"])
-    return f"{max(low, 0):.0f} to {high:.0f} % in the median, {100 * numbers['p95']:.0f} % at the 95th percentile"
+    return f"{max(low, 0):.1f} to {high:.1f} % in the median, {100 * numbers['p95']:.0f} % at the 95th percentile"
 
 
 def _expect_light(dataset_path: Path, report: dict[str, Any]) -> None:
