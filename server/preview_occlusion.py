@@ -42,14 +42,13 @@ def kept_share(rays: RayCaster, position: Float64, normal: Float32) -> Float32:
 def kept_in_picture(rays: RayCaster, position: Float64, normal: Float32, pixel: Int64, width: int) -> Float32:
     """``kept_share`` of what pixels (n,) of a picture so many pixels wide show, for a third of the rays' time."""
     row, column = np.divmod(pixel, width)
-    row -= row.min(initial=0)
     turn = (row % 2) * 2 + column % 2
     towards = sphere_lattice(RAYS)
     own = np.empty(len(pixel), np.float32)
     for number in range(TURNS):
         some = np.flatnonzero(turn == number)
         own[some] = _open_share(rays, position[some], normal[some], towards[number::TURNS])
-    share, is_whole = _shared_in_planes(own, position - rays.anchor, normal, row * width + column, width)
+    share, is_whole = _shared_in_planes(own, position - rays.anchor, normal, pixel, width)
     lacks = np.flatnonzero(~is_whole)
     share[lacks] = _open_share(rays, position[lacks], normal[lacks], towards)
     return _kept(share)
@@ -65,7 +64,7 @@ def _kept(share: Float32) -> Float32:
 
 def _shared_in_planes(own: Float32, local: Float64, normal: Float32, pixel: Int64, width: int) -> tuple[Float32, Bool]:
     """The mean of the four turns (n,), each the mean of those of the nine pixels around, in one plane, that have it; and which pixels have
-    all four. own (n,), at local (n, 3) [m] with normals (n, 3); pixel : (n,), from the first row on."""
+    all four. own (n,), of pixels (n,) that show places (n, 3) [m], near the origin, with normals (n, 3)."""
     if not len(own):
         return own, np.zeros(0, np.bool_)
     # A frame of pixels that show nothing.
