@@ -161,8 +161,12 @@ def box_slices(box: SectorBox) -> tuple[slice, slice, slice]:
 def nearest_columns(has_light: Bool) -> tuple[Int64, Int64]:
     """Columns (n, 2), (z, x), without light, and for each the nearest that has some, of which there is one at least: a volume has no black
     edge."""
-    # First along z, then, of what that found, along x: squares of distances add. Each carries its column, so that the least tells which.
     lack, (nz, nx) = np.argwhere(~has_light), has_light.shape
+    lines, columns = np.flatnonzero(has_light.any(axis=1)), np.flatnonzero(has_light.any(axis=0))
+    low, high = np.array([lines[0], columns[0]]), np.array([lines[-1], columns[-1]])
+    if nz * nx - len(lack) == np.prod(high - low + 1):  # a rectangle, as at the edge of most worlds, for a tenth of the time
+        return lack, np.clip(lack, low, high)
+    # First along z, then, of what that found, along x: squares of distances add. Each carries its column, so that the least tells which.
     square, line = np.divmod(_least_beside(np.where(has_light, np.int32(0), np.int32(nz * nz + nx * nx))), nz)
     column = _least_beside(square.T).T % nx
     z, x = lack.T

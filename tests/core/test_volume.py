@@ -1,6 +1,7 @@
 """Which sectors a volume reads, and what a client makes of it."""
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -59,6 +60,20 @@ def test_columns_without_light_copy_the_nearest_that_have_some():
     assert len(lack) == (~has_light).sum()
     assert (lack[:, 1] >= 4).all()
     np.testing.assert_array_equal(nearest, np.stack([lack[:, 0], np.full(len(lack), 3)], axis=1))
+
+
+@pytest.mark.parametrize("holes", [0.0, 0.1, 0.9])
+def test_no_column_that_has_light_is_nearer(holes):
+    """Also where those that have some are no rectangle."""
+    rng = np.random.default_rng(0)
+    has_light = np.zeros(VOLUME_SHAPE[1:], bool)
+    has_light[5:20, 9:12] = True
+    has_light &= rng.random(has_light.shape) >= holes
+    lack, nearest = nearest_columns(has_light)
+    np.testing.assert_array_equal(lack, np.argwhere(~has_light))
+    assert has_light[tuple(nearest.T)].all()
+    apart = np.square(lack[:, None] - np.argwhere(has_light)[None]).sum(axis=2)
+    np.testing.assert_array_equal(np.square(lack - nearest).sum(axis=1), apart.min(axis=1))
 
 
 def test_heights_beyond_a_sectors_layers_read_its_lowest_and_highest(make_sector):
