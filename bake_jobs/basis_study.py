@@ -13,14 +13,13 @@ halves, and as the time that NumPy takes to read it at a thousand points. Beside
 """
 
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 
-from bake_jobs.compare_points import look_around
+from bake_jobs.compare_points import drawn_by_area, look_around
 from bake_jobs.compare_states import parse_states
 from bake_jobs.config import settings_for
 from bake_jobs.inside import Solids
@@ -31,6 +30,7 @@ from bake_jobs.scene_source import load_scene
 from gi_core.ambient_cube import basis_weights
 from gi_core.arrays import AnyArray, Float32, Float64
 from gi_core.basis import evaluate, evaluation_weights, projection_weights
+from gi_core.bench import side_by_side
 from gi_core.constants import SECTOR_SIZE_M, VOLUME_SHAPE
 from gi_core.error_report import DARKEST_SHARE_OF_MEAN
 from gi_core.grid import SectorIndex
@@ -107,12 +107,9 @@ class Errors:
 def own_normals(scene: Scene, index: SectorIndex) -> Float64:
     """(OWN_NORMALS, 3) of triangles whose middle is in a sector, drawn by area; of all triangles where it has none."""
     corners = scene.vertices[scene.triangles]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.linalg.norm(cross, axis=1)
     here = (np.floor(corners.mean(axis=1)[:, [0, 2]] / SECTOR_SIZE_M) == np.array(index)).all(axis=1)
-    weight = np.where(here, area, 0) if area[here].sum() > 0 else area
-    chosen = np.random.default_rng(0).choice(len(area), OWN_NORMALS, p=weight / weight.sum())
-    return np.asarray(cross[chosen] / area[chosen, None])
+    drawn = (drawn_by_area(some, OWN_NORMALS, np.random.default_rng(0))[1] for some in (corners[here], corners))
+    return next(normals for normals in drawn if len(normals))
 
 
 def errors(source: str, sectors: list[SectorIndex], states: list[str]) -> dict[str, Errors]:
@@ -149,12 +146,8 @@ def microseconds(study: Study) -> float:
     """What reading a thousand points takes, the median of several times."""
     normals = spiral(TIMED_POINTS).astype(np.float32)
     coefficients = np.ones((TIMED_POINTS, study.coefficients, 3), np.float32)
-    took = []
-    for _ in range(TIMES):
-        begun = time.perf_counter()
-        study.rebuild(coefficients, normals)
-        took.append(time.perf_counter() - begun)
-    return float(np.median(took)) * 1e6 / TIMED_POINTS * 1000
+    read = partial(study.rebuild, coefficients, normals)
+    return side_by_side(read, read, rounds=TIMES)[0] * 1e6 / TIMED_POINTS * 1000
 
 
 def main() -> None:

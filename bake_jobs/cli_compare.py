@@ -3,8 +3,7 @@
 import io
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -58,20 +57,9 @@ def run(
         if path is not None:
             expect_file(path, option)
     lamps = None if lamps_path is None else load_lamps(lamps_path)
-    scene = None if source is None else load_scene(source)
-    with _progress() as advance:
-        report = compare_dataset(
-            dataset_path,
-            states,
-            sectors=sectors,
-            points_per_sector=points,
-            samples=samples,
-            seed=seed,
-            device=device,
-            scene=scene,
-            lamps=lamps,
-            progress=advance,
-        )
+    report = _measured(
+        dataset_path, states, source, sectors=sectors, points_per_sector=points, samples=samples, seed=seed, device=device, lamps=lamps
+    )
     console = Console()
     if not console.is_terminal:
         console = Console(width=REPORT_WIDTH)
@@ -90,18 +78,8 @@ def run(
 def report_bake(dataset_path: Path, source: str | None) -> None:
     """A small report of a bake that has just ended, kept in the dataset, and its gist on stderr. ``source`` is wanted where the bake left
     out what surrounds its sectors. Raises as ``run``."""
-    scene = None if source is None else load_scene(source)
     chosen = choose_sectors(Dataset.open(dataset_path), 0, BAKE_SECTORS)
-    with _progress() as advance:
-        report = compare_dataset(
-            dataset_path,
-            BAKE_STATES,
-            sectors=chosen,
-            points_per_sector=BAKE_POINTS,
-            samples=BAKE_SAMPLES,
-            scene=scene,
-            progress=advance,
-        )
+    report = _measured(dataset_path, BAKE_STATES, source, sectors=chosen, points_per_sector=BAKE_POINTS, samples=BAKE_SAMPLES)
     _expect_light(dataset_path, report)
     _store(dataset_path, report, has_source=source is not None)
     said = {state: in_words(report["states"][state][OWN]) for state in BAKE_STATES}
@@ -126,9 +104,9 @@ def _expect_light(dataset_path: Path, report: dict[str, Any]) -> None:
         raise NonsenseError(f"{dataset_path}: this dataset is nonsense: {said} {shown}; bake it again")
 
 
-@contextmanager
-def _progress() -> Iterator[Callable[[int, int, str], None]]:
-    """Shows how far a comparison is, as ``compare_dataset`` tells."""
+def _measured(dataset_path: Path, states: Sequence[str], source: str | None, **asked: Any) -> dict[str, Any]:
+    """What ``compare_dataset`` says, shown how far it is. ``source``: where the scene is; ``asked``: as it takes it."""
+    scene = None if source is None else load_scene(source)
     with Progress(
         TextColumn("comparing"),
         BarColumn(),
@@ -141,7 +119,11 @@ def _progress() -> Iterator[Callable[[int, int, str], None]]:
         transient=True,
     ) as progress:
         task = progress.add_task("", total=None)
-        yield lambda done, steps, what: progress.update(task, completed=done, total=steps, description=what)
+
+        def advance(done: int, steps: int, what: str) -> None:
+            progress.update(task, completed=done, total=steps, description=what)
+
+        return compare_dataset(dataset_path, states, scene=scene, progress=advance, **asked)
 
 
 def _store(dataset_path: Path, report: dict[str, Any], has_source: bool) -> None:

@@ -166,9 +166,7 @@ def compare_dataset(
 
     for number, index in enumerate(chosen):
         points = points_of(tracer, dataset, index, points_per_sector, seed)
-        in_rooms = None
-        if world.rooms:
-            in_rooms = points_in_rooms(dataset.geometry(index), world.rooms, points_per_sector, sector_rng(seed, index, _IN_ROOMS))
+        in_rooms = room_points_of(dataset, index, points_per_sector, seed) if world.rooms else None
         for place, (state, lighting) in enumerate(lightings.items()):
             volume = engine.volume(points.eye, lighting)
             if place == 0:
@@ -256,6 +254,11 @@ def dataset_tracer(dataset: Dataset, chosen: Sequence[SectorIndex], scene: Scene
 def points_of(tracer: PathTracer, dataset: Dataset, index: SectorIndex, count: int, seed: int) -> SectorPoints:
     """Where a sector is compared."""
     return choose_points(tracer.rays, dataset.geometry(index), dataset.sector(index), count, sector_rng(seed, index), dataset.world.rooms)
+
+
+def room_points_of(dataset: Dataset, index: SectorIndex, count: int, seed: int) -> tuple[Float64, Float64]:
+    """Points (n, 3) [m] on a sector's surfaces in rooms and normals (n, 3), where rooms are compared."""
+    return points_in_rooms(dataset.geometry(index), dataset.world.rooms, count, sector_rng(seed, index, _IN_ROOMS))
 
 
 def sector_rng(seed: int, index: SectorIndex, digest: str = "") -> np.random.Generator:

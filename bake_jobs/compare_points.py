@@ -175,17 +175,24 @@ def _rooms_off(point: Float64, normal: Float64, rooms: tuple[Room, ...]) -> UInt
 def _drawn_on(corners: Float64, count: int, rng: np.random.Generator) -> tuple[Float64, Float64]:
     """``count`` points spread evenly over triangles (n, 3, 3) [m], and normals, each of either sign; none where there is no area."""
     a, edges_b, edges_c = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    doubled = np.cross(edges_b, edges_c)
-    length = np.linalg.norm(doubled, axis=1)
-    if not length.sum() > 0 or count == 0:
+    chosen, normal = drawn_by_area(corners, count, rng)
+    if not len(chosen):
         return np.zeros((0, 3)), np.zeros((0, 3))
-    chosen = rng.choice(len(length), count, p=length / length.sum())
     u, v = rng.random((2, len(chosen), 1))
     folded = u + v > 1
     u, v = np.where(folded, 1 - u, u), np.where(folded, 1 - v, v)
-    normal = doubled[chosen] / length[chosen, None]
     normal[rng.random(len(normal)) < 0.5] *= -1
     return a[chosen] + u * edges_b[chosen] + v * edges_c[chosen], normal
+
+
+def drawn_by_area(corners: Float64, count: int, rng: np.random.Generator) -> tuple[Int64, Float64]:
+    """``count`` of triangles (n, 3, 3) [m], drawn by area, and their unit normals (count, 3); none where there is no area."""
+    doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(doubled, axis=1)
+    if not length.sum() > 0 or count == 0:
+        return np.zeros(0, np.int64), np.zeros((0, 3))
+    chosen = rng.choice(len(length), count, p=length / length.sum())
+    return chosen, doubled[chosen] / length[chosen, None]
 
 
 def _open_air_off(rays: RayScene, point: Float64, normal: Float64) -> Bool:

@@ -13,8 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from bake_jobs.compare import Reference, choose_sectors, dataset_tracer, sector_rng
-from bake_jobs.compare_points import points_in_rooms
+from bake_jobs.compare import Reference, choose_sectors, dataset_tracer, room_points_of, sector_rng
 from bake_jobs.compare_report import StageSamples, summarise
 from bake_jobs.compare_states import parse_states
 from gi_core.arrays import Float64
@@ -58,11 +57,12 @@ def study(
     chosen = choose_sectors(dataset, 0, sectors)
     tracer = dataset_tracer(dataset, chosen)
     names = ["served", *(f"exact, {VOXEL_SIZE_M * 2.0**cascade:.2f} m" for cascade in cascades)]
-    found = {state: {name: StageSamples() for name in names} for state in states}
-    for state in parse_states(states, world.location):
+    moments = parse_states(states, world.location)
+    found = {state.name: {name: StageSamples() for name in names} for state in moments}
+    for state in moments:
         lighting = engine.lighting(state.time, state.weather)
         for index in chosen:
-            surface, normal = points_in_rooms(dataset.geometry(index), world.rooms, points, sector_rng(0, index, "1"))
+            surface, normal = room_points_of(dataset, index, points, 0)
             if not len(surface):
                 continue
             rng = sector_rng(0, index, lighting.digest)
